@@ -1,0 +1,281 @@
+"""The ``sb3-flock`` command: words to calls. A command imports what it needs when it runs, so that ``--help`` is quick."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sb3_flock.settings import SettingsError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+USAGE_ERROR = 2
+INTERRUPTED = 130
+
+# Flags of `train` that are config fields: the field's path and the flag's metavar; the help is the field's description.
+_TRAIN_FLAGS = {
+    "--n-vehicles": ("scenario.n_vehicles", "N"),
+    "--n-obstacles": ("scenario.n_obstacles", "N"),
+    "--total-timesteps": ("total_timesteps", "N"),
+    "--seed": ("seed", "N"),
+    "--algo": ("algo", "NAME"),
+    "--n-flocks": ("n_flocks", "N"),
+    "--device": ("device", "NAME"),
+    "--output-dir": ("output_dir", "DIR"),
+    "--eval-freq": ("eval_freq", "N"),
+    "--save-freq": ("save_freq", "N"),
+    "--init-from": ("init_from", "POLICY"),
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command.
+
+    :param arguments: the words after ``sb3-flock``; the default is the process's own
+    :return: the exit code: 0, 2 after a user's mistake (told in one line on stderr), 130 after Ctrl-C
+    """
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    parser = _parser()
+    options = parser.parse_args(words)
+    try:
+        return int(options.run(options, words))
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except KeyboardInterrupt:
+        print("sb3-flock: interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except _user_errors() as error:
+        print(f"sb3-flock: {error}", file=sys.stderr)
+        return USAGE_ERROR
+
+
+def _user_errors() -> tuple[type[Exception], ...]:
+    """What a user's mistake raises; looked up late, for the modules are slow to import."""
+    errors: list[type[Exception]] = [SettingsError]
+    for module, name in (("sb3_flock.rl.saving", "PolicyError"), ("sb3_flock.sim.world", "WorldError")):
+        if module in sys.modules:
+            errors.append(getattr(sys.modules[module], name))
+    return tuple(errors)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(prog="sb3-flock", description="Vehicles that flock by reinforcement learning.")
+    parser.add_argument("--version", action=_Version, nargs=0, help="show the version and stop")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    _add_train(commands)
+    _add_evaluate(commands)
+    _add_config(commands)
+    return parser
+
+
+class _Parser(argparse.ArgumentParser):
+    """argparse with errors in our one line, and no guessing of abbreviated flags."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        kwargs.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
+        super().__init__(allow_abbrev=False, **kwargs)
+
+    def error(self, message: str) -> Any:
+        self.exit(USAGE_ERROR, f"{self.prog}: {message} (try {self.prog} --help)\n")
+
+
+class _Version(argparse.Action):
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
+        from importlib.metadata import version
+
+        print(f"sb3-flock {version('sb3_flock')}")
+        parser.exit()
+
+
+def _add_set(parser: argparse.ArgumentParser, example: str) -> None:
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help=f"change any other field, such as {example}; `sb3-flock config` lists them all",
+    )
+
+
+# -- train -----------------------------------------------------------------------------------------------------------
+
+
+def _add_train(commands: Any) -> None:
+    parser = commands.add_parser(
+        "train",
+        help="train a policy",
+        description="Train one shared policy and leave a run folder.",
+        epilog="example: sb3-flock train --n-vehicles 5 --n-obstacles 2 --set reward.lambda_=0.5",
+    )
+    _add_config_flags(parser)
+    parser.set_defaults(run=_train)
+
+
+def _add_config_flags(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--config", metavar="FILE", help="YAML file of parameters; flags below win over it")
+    descriptions = {
+        "scenario.n_vehicles": "number of vehicles",
+        "scenario.n_obstacles": "number of obstacles",
+    }
+    for flag, (path, metavar) in _TRAIN_FLAGS.items():
+        parser.add_argument(flag, dest=path, metavar=metavar, help=descriptions.get(path) or _LazyHelp(path))
+    _add_set(parser, "reward.lambda_=0.5")
+
+
+class _LazyHelp(str):
+    """A config field's own description and default, looked up when the help is printed (the config's import is slow)."""
+
+    __slots__ = ()
+
+    def __mod__(self, _: Any) -> str:
+        from sb3_flock.rl.config import TrainingConfig
+
+        field = TrainingConfig.model_fields[str(self)]
+        default = "" if field.default is None else f" [{field.default}]"
+        return f"{field.description}{default}"
+
+
+def _config_of(options: argparse.Namespace) -> Any:
+    from sb3_flock.rl.config import TrainingConfig
+    from sb3_flock.rl.config_io import load_config, parse_overrides
+
+    flags = {path: value for path, _ in _TRAIN_FLAGS.values() if (value := getattr(options, path)) is not None}
+    return load_config(TrainingConfig, options.config, {**flags, **parse_overrides(options.set)})
+
+
+def _train(options: argparse.Namespace, words: Sequence[str]) -> int:
+    import shlex
+
+    from rich.console import Console
+
+    config = _config_of(options)
+    console = Console(stderr=True)
+    from sb3_flock.rl.saving import load_policy
+    from sb3_flock.rl.training import train
+
+    result = train(config, console, command=[shlex.join(["sb3-flock", *words])])
+    policy = load_policy(result.best_model)
+    _evaluate_and_print(policy, config.scenario, episodes=1000, seed=0, console=console)
+    print(result.folder)
+    return 0
+
+
+# -- evaluate --------------------------------------------------------------------------------------------------------
+
+
+def _add_evaluate(commands: Any) -> None:
+    parser = commands.add_parser(
+        "evaluate",
+        help="fly a policy and print its metrics",
+        description="Fly a saved policy through many episodes at once and print every metric with its interval.",
+        epilog="example: sb3-flock evaluate runs/ddpg_5v2o_1 --n-vehicles 8 --json result.json",
+    )
+    parser.add_argument("policy", metavar="POLICY", help="a zip, or a run folder (its best_model.zip)")
+    parser.add_argument("--n-vehicles", dest="n_vehicles", metavar="N", help="number of vehicles [as trained]")
+    parser.add_argument("--n-obstacles", dest="n_obstacles", metavar="N", help="number of obstacles [as trained]")
+    parser.add_argument("--episodes", type=_count(1), default=1000, metavar="N", help="episodes to fly [1000]")
+    parser.add_argument("--seed", type=_count(0), default=0, metavar="N", help="seed of the episodes [0]")
+    parser.add_argument("--device", default="cpu", metavar="NAME", help="torch device [cpu]")
+    parser.add_argument("--json", metavar="FILE", help="write the metrics to this file, too")
+    _add_set(parser, "obstacle_arena=0.5")
+    parser.set_defaults(run=_evaluate)
+
+
+def _count(least: int) -> Any:
+    def integer(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            value = least - 1
+        if value < least:
+            raise argparse.ArgumentTypeError(f"{text}: an integer of at least {least} is needed")
+        return value
+
+    return integer
+
+
+def _evaluate(options: argparse.Namespace, words: Sequence[str]) -> int:
+    from rich.console import Console
+
+    from sb3_flock.rl.config_io import load_config, parse_overrides
+    from sb3_flock.rl.saving import load_policy
+    from sb3_flock.sim import Scenario
+
+    if options.json is not None and not Path(options.json).absolute().parent.is_dir():
+        raise SettingsError(f"--json {options.json}: there is no folder {Path(options.json).parent}")
+    policy = load_policy(options.policy, options.device)
+    overrides = parse_overrides(options.set)
+    overrides.update({key: value for key in ("n_vehicles", "n_obstacles") if (value := getattr(options, key)) is not None})
+    scenario = load_config(Scenario, overrides=overrides, base=policy.scenario)
+    metrics = _evaluate_and_print(policy, scenario, options.episodes, options.seed, Console(stderr=True))
+    if options.json is not None:
+        from sb3_flock.evaluation.report import write_json
+        from sb3_flock.rl.saving import versions
+
+        meta = {
+            "policy": str(policy.path),
+            "algo": policy.config.algo,
+            "num_timesteps": policy.num_timesteps,
+            "episodes": options.episodes,
+            "seed": options.seed,
+            "scenario": scenario.model_dump(mode="json"),
+            "trained_with": policy.versions,
+            "evaluated_with": versions(),
+        }
+        try:
+            write_json(options.json, metrics, meta)
+        except OSError as error:
+            raise SettingsError(f"--json {options.json}: {error.strerror or error}") from None
+    return 0
+
+
+def _evaluate_and_print(policy: Any, scenario: Any, episodes: int, seed: int, console: Console) -> Any:
+    import torch as th
+    from rich.console import Console as RichConsole
+
+    from sb3_flock.evaluation import evaluate
+    from sb3_flock.evaluation.report import metrics_table
+
+    th.set_num_threads(1)
+    with warnings.catch_warnings(record=True) as caught, console.status(f"flying {episodes} episodes"):
+        warnings.simplefilter("always", UserWarning)
+        metrics = evaluate(policy, scenario, episodes, seed)
+    for warning in caught:
+        print(f"sb3-flock: warning: {warning.message}", file=sys.stderr)
+    title = (
+        f"{policy.path}: {scenario.n_vehicles} vehicles, {scenario.n_obstacles} obstacles, {episodes} episodes, seed {seed}"
+    )
+    RichConsole().print(metrics_table(metrics, scenario, title))
+    return metrics
+
+
+# -- config ----------------------------------------------------------------------------------------------------------
+
+
+def _add_config(commands: Any) -> None:
+    parser = commands.add_parser(
+        "config",
+        help="print a training's whole config, every key explained",
+        description="Print the config that `train` would run with the same flags, as YAML with a comment on every key.",
+        epilog="example: sb3-flock config --n-vehicles 5 > mine.yaml",
+    )
+    _add_config_flags(parser)
+    parser.set_defaults(run=_print_config)
+
+
+def _print_config(options: argparse.Namespace, words: Sequence[str]) -> int:
+    from sb3_flock.rl.config_io import to_yaml
+
+    print(to_yaml(_config_of(options)), end="")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

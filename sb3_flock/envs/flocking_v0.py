@@ -1,0 +1,201 @@
+"""Flocking: vehicles follow a moving waypoint together, keep apart, avoid obstacles and stay in touch.
+
+========================  ==========================================================================================
+Import                    ``from sb3_flock import flocking_v0`` or ``pettingzoo.make("parallel", "flock/flocking-v0")``
+Agents                    ``vehicle_0`` ... ``vehicle_{n-1}``; all live through the whole episode
+Actions                   continuous, ``Box([0, -pi], [0.15, pi], (2,))``: speed v [m/s] and turn rate omega [rad/s]
+Observations              ``Box(0, inf, (3, 11, 11), float32)``: neighbors, obstacles, waypoint in the body frame
+Rewards                   r_i of section IV-B, without the neighbors' share (:func:`sb3_flock.sim.mix_rewards` mixes)
+Termination, truncation   never terminated; all agents are truncated after ``max_cycles`` steps
+Rendering                 ``human`` (a window; needs pygame) and ``rgb_array``
+========================  ==========================================================================================
+
+**Observation.** ``obs[c, a, b]``: channel c (0 neighbors, 1 obstacles, 2 waypoint) at anchor a along the body's forward
+axis and b along its left axis; see :mod:`sb3_flock.sim.observation`. The shape does not depend on the number of vehicles or
+obstacles, so that a policy flies in a flock of any size.
+
+**Reward.** The sum of four named terms: ``connectivity`` pays for each neighbor at a safe distance and fines each one that
+is too close, ``obstacle`` fines each obstacle that is too close, ``waypoint`` fines the distance to the waypoint and
+``control`` large actions.
+
+**Infos** of a step, per agent (those of a reset are empty):
+
+* ``neighbors``: indices into ``possible_agents`` of the agents within ``link_range``, ascending, as an int array;
+* ``reward_terms``: the four terms by name, floats that sum to the reward;
+* ``metrics``: ``tracking_error`` (distance to the waypoint, m), ``nearest_neighbor`` and ``nearest_obstacle`` (m; inf if
+  there is none at all), ``neighbor_violation`` and ``obstacle_violation`` (whether one is closer than its minimum
+  separation), ``connected`` (whether the whole flock's proximity graph is connected);
+* ``TimeLimit.truncated``: whether the time limit alone ended the episode, at the last step.
+
+**Arguments.** Any field of :class:`sb3_flock.Scenario` by name (``n_vehicles``, ``n_obstacles``, ``max_cycles``, ...), or a
+ready ``scenario``, and ``render_mode``.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+from pettingzoo import AECEnv, ParallelEnv
+from pettingzoo.utils import wrappers
+from pettingzoo.utils.conversions import parallel_to_aec
+
+from sb3_flock.settings import SettingsError
+from sb3_flock.sim import Scenario, Sensing, World, observe, reward_terms
+from sb3_flock.sim.sensing import is_connected
+
+Observation = NDArray[np.float32]
+Action = NDArray[np.float32]
+
+
+def env(**kwargs: Any) -> AECEnv:
+    """The turn-based form with PettingZoo's usual wrappers: out-of-bounds actions are clipped, misuse is an error."""
+    return wrappers.OrderEnforcingWrapper(wrappers.ClipOutOfBoundsWrapper(raw_env(**kwargs)))
+
+
+def raw_env(**kwargs: Any) -> AECEnv:
+    """The turn-based form of :class:`parallel_env`."""
+    return parallel_to_aec(parallel_env(**kwargs))
+
+
+def observation_space(scenario: Scenario) -> spaces.Box:
+    """One vehicle's observation space; unbounded above, so that it fits any number of vehicles."""
+    return spaces.Box(0.0, np.inf, scenario.observation_shape, np.float32)
+
+
+def action_space(scenario: Scenario) -> spaces.Box:
+    """One vehicle's action space: speed [m/s] and turn rate [rad/s]."""
+    high = np.array([scenario.max_speed, scenario.max_turn_rate], dtype=np.float32)
+    return spaces.Box(np.array([0.0, -high[1]], dtype=np.float32), high, dtype=np.float32)
+
+
+class parallel_env(ParallelEnv[str, Observation, Action]):  # noqa: N801 - PettingZoo's name for it
+    """The flocking task as a PettingZoo ``ParallelEnv``: a :class:`~sb3_flock.sim.World` of one flock.
+
+    :param scenario: the task; fields given by name change it
+    :param render_mode: ``None``, ``"human"`` or ``"rgb_array"``
+    :param fields: fields of :class:`~sb3_flock.Scenario` by name
+    :raises SettingsError: for an unknown field, a value that is not accepted or an unknown render mode
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {
+        "name": "flocking_v0",
+        "render_modes": ["human", "rgb_array"],
+        "is_parallelizable": True,
+        "render_fps": 10,
+    }
+
+    def __init__(self, scenario: Scenario | None = None, render_mode: str | None = None, **fields: Any) -> None:
+        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
+            raise SettingsError(f"render_mode = {render_mode!r}: one of {self.metadata['render_modes']} or None is needed")
+        self.scenario = (scenario or Scenario()).replace(**fields)
+        self.render_mode = render_mode
+        self.possible_agents = [f"vehicle_{i}" for i in range(self.scenario.n_vehicles)]
+        self.agents: list[str] = []
+        self._observation_spaces = {agent: observation_space(self.scenario) for agent in self.possible_agents}
+        self._action_spaces = {agent: action_space(self.scenario) for agent in self.possible_agents}
+        self.world = World(self.scenario, n_flocks=1)
+        self._rng: np.random.Generator | None = None
+        self._renderer: Any = None
+
+    def observation_space(self, agent: str) -> spaces.Box:
+        """The observation space of an agent; the same object at every call."""
+        return self._observation_spaces[agent]
+
+    def action_space(self, agent: str) -> spaces.Box:
+        """The action space of an agent; the same object at every call."""
+        return self._action_spaces[agent]
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Observation], dict[str, dict[str, Any]]]:
+        """Start an episode.
+
+        :param seed: seeds this env's random stream; without one the stream goes on (the first reset draws a fresh one)
+        :param options: ignored
+        :return: observations and empty infos by agent
+        """
+        if seed is not None or self._rng is None:
+            self._rng = np.random.default_rng(seed)
+        self.agents = list(self.possible_agents)
+        sensing = self.world.reset([self._rng])
+        return self._observations(sensing), {agent: {} for agent in self.agents}
+
+    def step(
+        self, actions: dict[str, Action]
+    ) -> tuple[
+        dict[str, Observation], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]
+    ]:
+        """Move everything by one sampling period; see the module's page for what comes back."""
+        sensing, clipped = self.world.step([[actions[agent] for agent in self.agents]])
+        terms = {name: term[0] for name, term in reward_terms(sensing, clipped, self.scenario).items()}
+        rewards = sum(terms.values())
+        truncated = self.world.steps >= self.scenario.max_cycles
+        infos = self._infos(sensing, terms, truncated)
+        result = (
+            self._observations(sensing),
+            dict(zip(self.agents, rewards.tolist(), strict=True)),
+            dict.fromkeys(self.agents, False),
+            dict.fromkeys(self.agents, truncated),
+            infos,
+        )
+        if truncated:
+            self.agents = []
+        if self.render_mode == "human":
+            self.render()
+        return result
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Draw the flock: an ``(height, width, 3)`` picture in ``rgb_array`` mode, a window in ``human`` mode.
+
+        :raises ImportError: in ``human`` mode without pygame
+        """
+        if self.render_mode is None:
+            return None
+        if self._renderer is None:
+            from sb3_flock.envs.rendering import Renderer
+
+            self._renderer = Renderer(self.scenario, self.render_mode, self.metadata["render_fps"])
+        return self._renderer.draw(self.world)
+
+    def state(self) -> NDArray[np.float32]:
+        """All vehicles' observations stacked, ``(vehicles, 3, l, l)``."""
+        from sb3_flock.sim import sense
+
+        return observe(sense(self.world), self.scenario)[0]
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+    def _observations(self, sensing: Sensing) -> dict[str, Observation]:
+        return dict(zip(self.possible_agents, observe(sensing, self.scenario)[0], strict=True))
+
+    def _infos(
+        self, sensing: Sensing, terms: dict[str, NDArray[np.float64]], truncated: bool
+    ) -> dict[str, dict[str, Any]]:
+        scenario = self.scenario
+        nearest_neighbor = sensing.neighbor_distances[0].min(-1, initial=np.inf)
+        nearest_obstacle = sensing.obstacle_distances[0].min(-1, initial=np.inf)
+        connected = bool(is_connected(sensing.neighbors)[0])
+        infos: dict[str, dict[str, Any]] = {}
+        for i, agent in enumerate(self.agents):
+            infos[agent] = {
+                "neighbors": np.flatnonzero(sensing.neighbors[0, i]),
+                "reward_terms": {name: float(term[i]) for name, term in terms.items()},
+                "metrics": {
+                    "tracking_error": float(sensing.waypoint_distances[0, i]),
+                    "nearest_neighbor": float(nearest_neighbor[i]),
+                    "nearest_obstacle": float(nearest_obstacle[i]),
+                    "neighbor_violation": bool(nearest_neighbor[i] < scenario.neighbor_separation),
+                    "obstacle_violation": bool(nearest_obstacle[i] < scenario.obstacle_separation),
+                    "connected": connected,
+                },
+            }
+            if truncated:
+                infos[agent]["TimeLimit.truncated"] = True
+        return infos

@@ -1,0 +1,209 @@
+"""The SuperSuit flattening of a PettingZoo env into one SB3 vector env with shared parameters, its gaps mended.
+
+Every agent of every copy becomes one slot of the vector env, copy by copy: slot ``copy * n_agents + i`` is the copy's agent
+``possible_agents[i]``, and its action goes to that agent alone. One policy serves all slots: that is parameter sharing.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+import supersuit
+from numpy.typing import NDArray
+from pettingzoo import ParallelEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
+from supersuit.vector.concat_vec_env import ConcatVecEnv
+from supersuit.vector.multiproc_vec import ProcConcatVec, numpy_deepcopy
+from supersuit.vector.sb3_vector_wrapper import SB3VecEnvWrapper
+
+from sb3_flock.envs import flocking_v0
+from sb3_flock.settings import SettingsError
+from sb3_flock.sim import Scenario
+
+
+def make_vec_env(
+    scenario: Scenario | None = None,
+    n_flocks: int = 8,
+    num_cpus: int = 0,
+    seed: int | None = None,
+    render_mode: str | None = None,
+) -> ParameterSharingVecEnv:
+    """Flocks of one scenario as an SB3 vector env with ``n_flocks * n_vehicles`` slots.
+
+    :param scenario: the task; the default is the paper's experiment 1
+    :param n_flocks: number of independent flocks
+    :param num_cpus: worker processes; 0 keeps everything in this process, which is faster for this light env
+    :param seed: seeds all flocks, each with a stream of its own, whatever ``num_cpus``
+    :param render_mode: as in :class:`~sb3_flock.envs.flocking_v0.parallel_env`; the first flock is drawn
+    :raises SettingsError: for a count that is not accepted
+    """
+    return flatten(flocking_v0.parallel_env(scenario, render_mode=render_mode), n_flocks, num_cpus, seed)
+
+
+def flatten(env: ParallelEnv, n_copies: int = 1, num_cpus: int = 0, seed: int | None = None) -> ParameterSharingVecEnv:
+    """Any PettingZoo parallel env whose agents share their spaces, copied and flattened into one SB3 vector env.
+
+    :param env: the env; all of its agents must live as long as the episode
+    :param n_copies: number of independent copies
+    :param num_cpus: worker processes; 0 and 1 keep everything in this process
+    :param seed: seeds all copies, each with a stream of its own
+    :raises SettingsError: for a count that is not accepted
+    """
+    for name, value, least in (("n_copies", n_copies, 1), ("num_cpus", num_cpus, 0)):
+        if not isinstance(value, (int, np.integer)) or value < least:
+            raise SettingsError(f"{name} = {value!r}: input should be an integer of at least {least}")
+    flat = supersuit.pettingzoo_env_to_vec_env_v1(env)
+    vec_env = supersuit.concat_vec_envs_v1(flat, n_copies, num_cpus=num_cpus, base_class="gymnasium")
+    adapter = ParameterSharingVecEnv(vec_env, env)
+    adapter.seed(seed)
+    return adapter
+
+
+class ParameterSharingVecEnv(SB3VecEnvWrapper):
+    """SuperSuit's SB3 wrapper with its gaps mended; use :func:`make_vec_env` or :func:`flatten` to build one.
+
+    What it adds: seeds that reproduce and that differ between copies, with and without workers; ``TimeLimit.truncated``
+    wherever an episode is cut and not ended; boolean ``dones``; SB3's ``get_attr``, ``set_attr`` and ``env_method`` (without
+    workers); ``render_mode`` through wrappers and workers; one clear error when a worker dies, and workers that close.
+
+    :ivar n_agents: agents of one copy; slot ``s`` is agent ``s % n_agents`` of copy ``s // n_agents``
+    """
+
+    def __init__(self, venv: ConcatVecEnv | ProcConcatVec, example: ParallelEnv) -> None:
+        self.n_agents = len(example.possible_agents)
+        if isinstance(venv, ProcConcatVec):
+            venv.render_mode = example.unwrapped.render_mode
+        super().__init__(venv)
+        self.metadata = venv.metadata
+        self.reset_infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        self._has_workers = isinstance(venv, ProcConcatVec)
+        self._seed: int | None = None
+        self._unseeded = True
+        self._closed = False
+
+    # -- seeding -----------------------------------------------------------------------------------------------------
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Store a seed for the next reset, as SB3's own vector envs do; ``None`` means fresh entropy at the first one."""
+        self._seed = seed
+        return [seed] * self.num_envs
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> NDArray[Any]:
+        """Reset every copy; one that was seeded since the last reset starts its random stream anew.
+
+        :return: observations, ``(slots, *observation shape)``
+        """
+        if seed is not None:
+            self.seed(seed)
+        if self._seed is None and not self._unseeded:
+            first = None  # every copy's own stream goes on
+        else:
+            # SuperSuit hands copy i the seed `first + i`; hashing keeps the copies of neighboring seeds apart.
+            first = int(np.random.SeedSequence(self._seed).generate_state(1)[0]) // 2
+        self._seed, self._unseeded = None, False
+        if self._has_workers:
+            observations, infos = self._reset_workers(first, options)
+        else:
+            observations, infos = self.venv.reset(seed=first, options=options)
+        self.reset_infos = infos
+        return observations
+
+    def _reset_workers(self, first: int | None, options: dict[str, Any] | None) -> tuple[Any, list[dict[str, Any]]]:
+        """Seed the workers' copies as if they were in this process; SuperSuit would let their seeds overlap."""
+        for pipe, start in zip(self.venv.pipes, self.venv.idx_starts, strict=False):
+            pipe.send(("reset", (None if first is None else first + start // self.n_agents, options)))
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        for start, compressed in zip(self.venv.idx_starts, self.venv._receive_info(), strict=False):
+            for slot, info in compressed:
+                infos[start + slot] = info
+        return numpy_deepcopy(self.venv.observations_buffers), infos
+
+    # -- stepping ----------------------------------------------------------------------------------------------------
+
+    def step_async(self, actions: NDArray[Any]) -> None:
+        """Send one action to each slot."""
+        try:
+            self.venv.step_async(actions)
+        except (EOFError, OSError) as error:
+            raise self._worker_died() from error
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Collect the step: ``(observations, rewards, dones, infos)`` as SB3 expects them."""
+        try:
+            observations, rewards, terminations, truncations, infos = self.venv.step_wait()
+        except (EOFError, OSError) as error:
+            raise self._worker_died() from error
+        terminations, truncations = np.asarray(terminations, dtype=bool), np.asarray(truncations, dtype=bool)
+        dones = terminations | truncations
+        for slot in np.flatnonzero(dones):
+            infos[slot] = {**infos[slot], "TimeLimit.truncated": bool(truncations[slot] and not terminations[slot])}
+        return observations, rewards, dones, infos
+
+    def _worker_died(self) -> RuntimeError:
+        dead = [f"{proc.pid} (exit code {proc.exitcode})" for proc in self.venv.procs if not proc.is_alive()]
+        self.close()
+        return RuntimeError(f"an environment worker died: process {', '.join(dead) or 'unknown'}; the rest was closed")
+
+    def close(self) -> None:
+        """Close every copy, in the workers too, and end the workers."""
+        if self._closed:
+            return
+        self._closed = True
+        if not self._has_workers:
+            self.venv.close()
+            return
+        for pipe, proc in zip(self.venv.pipes, self.venv.procs, strict=True):
+            try:
+                pipe.send("close")
+                pipe.recv()
+                pipe.send("terminate")
+            except (EOFError, OSError):
+                proc.kill()  # it is dead, or not listening
+            proc.join(self.venv.graceful_shutdown_timeout)
+        self.venv.close()
+
+    # -- SB3's access to the copies ----------------------------------------------------------------------------------
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """The attribute of each slot's copy; ``render_mode`` also with workers."""
+        if attr_name == "render_mode":
+            return [self.render_mode for _ in self._get_indices(indices)]
+        return [getattr(env.unwrapped, attr_name) for env in self._copies(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Set an attribute on each slot's copy."""
+        for env in self._copies(indices):
+            setattr(env.unwrapped, attr_name, value)
+
+    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+        """Call a method once a slot on the slot's copy."""
+        return [getattr(env.unwrapped, method_name)(*args, **kwargs) for env in self._copies(indices)]
+
+    def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
+        """Always false: the copies are PettingZoo envs, and the wrappers meant here are gymnasium's."""
+        return [False for _ in self._get_indices(indices)]
+
+    def get_images(self) -> list[NDArray[np.uint8] | None]:
+        """One picture a copy, or of the first copy alone with workers."""
+        if self._has_workers:
+            return [self.render()]
+        return [env.render() for env in self._copies(range(0, self.num_envs, self.n_agents))]
+
+    def render(self, mode: str | None = None) -> NDArray[np.uint8] | None:
+        """Draw the first copy in the render mode it was made with; ``mode`` is there for SB3's sake and must agree."""
+        if mode is not None and mode != self.render_mode:
+            warnings.warn(f"mode {mode!r} is ignored: the env was made with render_mode={self.render_mode!r}", stacklevel=2)
+        return self.venv.render()
+
+    def getattr_recursive(self, name: str) -> Any:
+        """Let SB3's wrappers around this one see its attributes."""
+        return getattr(self, name)
+
+    def _copies(self, indices: Any) -> Iterable[ParallelEnv]:
+        if self._has_workers:
+            raise NotImplementedError("SuperSuit's workers give no access to their envs: use num_cpus=0")
+        for slot in self._get_indices(indices):
+            yield self.venv.vec_envs[slot // self.n_agents].par_env

@@ -1,0 +1,102 @@
+"""Flying many episodes at once with any controller."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_flock.evaluation.metrics import EpisodeMetrics, Metric, summarize
+from sb3_flock.settings import SettingsError
+from sb3_flock.sim import Scenario, Sensing, World, episode_rng, observe, reward_terms
+
+BATCH = 250
+"""Episodes flown at once; it bounds the memory and changes no number."""
+
+_BLOCK = 256
+"""Rows a network sees at once, filled up with zeros. Matrix products of another shape may round otherwise; with one shape
+only, a vehicle's action does not depend on how many others are computed beside it."""
+
+
+class Controller(Protocol):
+    """Whatever can fly vehicles: a learned policy or a hand-written law."""
+
+    def act(self, sensing: Sensing, scenario: Scenario) -> NDArray[np.floating]:
+        """The actions ``(flocks, vehicles, 2)`` [m/s, rad/s], each from what its own vehicle senses alone."""
+        ...
+
+
+class PolicyController:
+    """Flies anything with SB3's ``predict(observations, deterministic=...)``: a model, its policy or a loaded one.
+
+    :param policy: the policy; one row of its input is one vehicle's tensor
+    """
+
+    def __init__(self, policy: Any) -> None:
+        self.policy = policy
+
+    def act(self, sensing: Sensing, scenario: Scenario) -> NDArray[np.floating]:
+        """Deterministic actions from the tensors."""
+        tensors = observe(sensing, scenario)
+        rows = tensors.reshape(-1, *scenario.observation_shape)
+        padded = np.zeros((-(-len(rows) // _BLOCK) * _BLOCK, *rows.shape[1:]), dtype=rows.dtype)
+        padded[: len(rows)] = rows
+        actions = [
+            self.policy.predict(padded[start : start + _BLOCK], deterministic=True)[0]
+            for start in range(0, len(padded), _BLOCK)
+        ]
+        return np.concatenate(actions)[: len(rows)].reshape(*tensors.shape[:2], 2)
+
+
+def fly(
+    controller: Controller,
+    scenario: Scenario,
+    episodes: int,
+    seed: int,
+    batch: int = BATCH,
+    on_batch: Callable[[int], None] | None = None,
+) -> dict[str, NDArray[np.float64]]:
+    """Fly episodes 0 ... ``episodes - 1`` of a seed.
+
+    :param batch: episodes flown at once; it changes no number
+    :param on_batch: called with the number of episodes done so far
+    :return: each metric's value for each episode, ``(episodes,)``
+    :raises SettingsError: for counts that are not accepted
+    """
+    for name, value, least in (("episodes", episodes, 1), ("seed", seed, 0), ("batch", batch, 1)):
+        if value < least:
+            raise SettingsError(f"{name} = {value}: input should be at least {least}")
+    results = []
+    for start in range(0, episodes, batch):
+        numbers = range(start, min(start + batch, episodes))
+        world = World(scenario, len(numbers))
+        metrics = EpisodeMetrics(scenario, len(numbers))
+        sensing = world.reset([episode_rng(seed, episode) for episode in numbers])
+        for _ in range(scenario.max_cycles):
+            sensing, clipped = world.step(controller.act(sensing, scenario))
+            metrics.update(sensing, sum(reward_terms(sensing, clipped, scenario).values()))
+        results.append(metrics.result())
+        if on_batch is not None:
+            on_batch(numbers.stop)
+    return {name: np.concatenate([result[name] for result in results]) for name in results[0]}
+
+
+def evaluate(
+    policy: Any, scenario: Scenario | None = None, episodes: int = 1000, seed: int = 0, batch: int = BATCH
+) -> dict[str, Metric]:
+    """Judge a policy or any other controller.
+
+    :param policy: a :class:`Controller`, or anything with SB3's ``predict``
+    :param scenario: the task to fly; the default is the one a loaded policy was trained for
+    :param episodes: number of episodes
+    :param seed: episode e draws from ``SeedSequence([seed, e])``
+    :return: every metric of :data:`~sb3_flock.evaluation.METRICS` by name
+    :raises SettingsError: for counts that are not accepted, or without a scenario
+    """
+    scenario = scenario or getattr(policy, "scenario", None)
+    if scenario is None:
+        raise SettingsError("scenario = None: the policy carries none, so one is needed")
+    controller = policy if hasattr(policy, "act") else PolicyController(policy)
+    return summarize(fly(controller, scenario, episodes, seed, batch))

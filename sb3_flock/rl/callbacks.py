@@ -1,0 +1,125 @@
+"""SB3 callbacks: the neighbor-inclusive reward, the flock's metrics in the log, exploration that fades."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNoise
+
+from sb3_flock.settings import SettingsError
+from sb3_flock.sim import mix_rewards
+
+
+class NeighborInclusiveReward(BaseCallback):
+    """Rewrites each transition's reward into r_{i} = lambda r_i + (1 - lambda) mean of the neighbors' r_j (section IV-B).
+
+    It works on any PettingZoo env flattened by SuperSuit into a parameter-shared vector env whose infos follow this
+    contract: ``info["neighbors"]`` holds the indices into ``possible_agents`` of the agent's own copy of the env. An info
+    without that key means no neighbors, and the agent keeps its own reward.
+
+    SB3 calls it after the env's step and before the transition is stored, and the rewards are rewritten in place: the
+    replay buffer takes the mixed ones. The raw reward stays where it was, in ``rollout/ep_rew_mean`` and in each info's
+    ``reward`` key (put there by this callback); the mixed one is logged as ``rollout/ep_mixed_rew_mean``.
+
+    :param lambda_: share of a vehicle's own reward, in [0, 1]
+    :param n_agents: agents in one copy of the env; found by itself on :func:`sb3_flock.flatten`'s vector envs
+    :param verbose: SB3's verbosity
+    :raises SettingsError: for a share outside [0, 1]; at the start of the training, if the agents cannot be counted or the
+        env is wrapped in ``VecNormalize``, which would store its own rewards and throw the mixed ones away
+    """
+
+    def __init__(self, lambda_: float = 0.7, n_agents: int | None = None, verbose: int = 0) -> None:
+        super().__init__(verbose)
+        if not 0 <= lambda_ <= 1:
+            raise SettingsError(f"lambda_ = {lambda_}: input should be between 0 and 1")
+        self.lambda_ = lambda_
+        self.n_agents = n_agents
+        self._returns = np.zeros(0)
+        self._finished: list[float] = []
+
+    def _init_callback(self) -> None:
+        if self.model.get_vec_normalize_env() is not None:
+            raise SettingsError(
+                "VecNormalize is not accepted: the replay buffer would take its rewards and not the neighbor-inclusive ones"
+            )
+        n_envs = self.training_env.num_envs
+        n_agents = self.n_agents or getattr(self.training_env, "n_agents", None)
+        if n_agents is None or n_envs % n_agents:
+            raise SettingsError(
+                f"n_agents = {n_agents}: the number of agents in one copy of the env is needed, a divisor of {n_envs}"
+            )
+        self.n_agents = n_agents
+        self._returns = np.zeros(n_envs)
+
+    def _on_step(self) -> bool:
+        rewards, infos, dones = self.locals["rewards"], self.locals["infos"], self.locals["dones"]
+        for info, reward in zip(infos, rewards, strict=True):
+            info["reward"] = float(reward)
+        rewards[:] = self.mix(rewards, infos)
+        self._returns += rewards
+        if dones.any():
+            self._finished += self._returns[dones].tolist()
+            self._returns[dones] = 0.0
+        return True
+
+    def mix(self, rewards: np.ndarray, infos: list[dict[str, Any]]) -> np.ndarray:
+        """The mixed reward of every slot of the vector env, ``(slots,)``."""
+        assert self.n_agents is not None
+        neighbors = np.zeros((len(infos), self.n_agents), dtype=bool)
+        for slot, info in enumerate(infos):
+            neighbors[slot, info.get("neighbors", ())] = True
+        by_copy = (-1, self.n_agents)
+        return mix_rewards(rewards.reshape(by_copy), neighbors.reshape(*by_copy, self.n_agents), self.lambda_).ravel()
+
+    def _on_rollout_end(self) -> None:
+        if self._finished:
+            self.logger.record_mean("rollout/ep_mixed_rew_mean", float(np.mean(self._finished)))
+            self._finished = []
+
+
+class FlockMetrics(BaseCallback):
+    """Logs the infos' ``metrics`` and ``reward_terms`` as ``flock/...``: means over all transitions since the last dump."""
+
+    def __init__(self, verbose: int = 0) -> None:
+        super().__init__(verbose)
+        self._sums: dict[str, float] = defaultdict(float)
+        self._count = 0
+
+    def _on_step(self) -> bool:
+        for info in self.locals["infos"]:
+            for name, value in {**info.get("metrics", {}), **info.get("reward_terms", {})}.items():
+                if np.isfinite(value):
+                    self._sums[name] += value
+            self._count += 1
+        if self.locals["dones"].any():
+            for name, total in self._sums.items():
+                self.logger.record(f"flock/{name}", total / self._count)
+            self._sums.clear()
+            self._count = 0
+        return True
+
+
+class FadingNoise(BaseCallback):
+    """Lets Gaussian exploration noise fade linearly over the training.
+
+    :param start: standard deviation at the start, in units of the normalized action
+    :param end: standard deviation at the end
+    """
+
+    def __init__(self, start: float, end: float) -> None:
+        super().__init__()
+        self.start, self.end = start, end
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_start(self) -> None:
+        noise = self.model.action_noise  # type: ignore[attr-defined]
+        sigma = self.end + (self.start - self.end) * self.model._current_progress_remaining
+        for part in noise.noises if isinstance(noise, VectorizedActionNoise) else [noise]:
+            if isinstance(part, NormalActionNoise):
+                part._sigma = np.full_like(part._sigma, sigma)
+        self.logger.record("train/noise", sigma)

@@ -1,0 +1,116 @@
+"""Reading and writing configs: YAML with a comment on every key, and ``key=value`` overrides."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+
+from sb3_flock.settings import Settings, SettingsError, nearest, resolve_path
+
+_Settings = TypeVar("_Settings", bound=Settings)
+
+
+def load_config(
+    settings: type[_Settings],
+    path: str | Path | None = None,
+    overrides: Mapping[str, Any] | None = None,
+    base: _Settings | None = None,
+) -> _Settings:
+    """A config from a YAML file, from another config or from the defaults, with overrides applied.
+
+    :param path: YAML file; keys it leaves out keep their defaults
+    :param base: the config to start from, instead of a file
+    :param overrides: values by parameter name, leading groups may be left out (``reward.lambda_``)
+    :raises SettingsError: one line for a file or a value that is not accepted
+    """
+    values: dict[str, Any] = {} if base is None else base.model_dump()
+    if path is not None:
+        values = _read_yaml(Path(path))
+    _check_groups(settings, values, "")
+    for key, value in (overrides or {}).items():
+        *groups, name = resolve_path(settings, key)
+        level = values
+        for group in groups:
+            level = level.setdefault(group, {})
+        level[name] = value
+    return settings(**values)
+
+
+def parse_overrides(assignments: Iterable[str]) -> dict[str, Any]:
+    """``["reward.lambda_=0.5", ...]`` as a mapping; values are read as YAML.
+
+    :raises SettingsError: for an assignment without ``=`` or a value that is not YAML
+    """
+    overrides = {}
+    for assignment in assignments:
+        key, equals, text = assignment.partition("=")
+        if not equals or not key:
+            raise SettingsError(f"--set {assignment}: KEY=VALUE is needed, such as reward.lambda_=0.5")
+        try:
+            overrides[key] = _number(yaml.safe_load(text))
+        except yaml.YAMLError:
+            raise SettingsError(f"--set {assignment}: the value is not YAML") from None
+    return overrides
+
+
+def to_yaml(config: Settings) -> str:
+    """The config as YAML, every key commented with its description."""
+    return "\n".join(_lines(config, indent="")) + "\n"
+
+
+def _lines(config: Settings, indent: str) -> Iterable[str]:
+    for name, field in type(config).model_fields.items():
+        value = getattr(config, name)
+        if isinstance(value, Settings):
+            yield f"{indent}{name}: # {field.description}"
+            yield from _lines(value, indent + "  ")
+        else:
+            plain = config.model_dump(mode="json", include={name})[name]
+            text = yaml.safe_dump(plain, default_flow_style=True, sort_keys=False, width=10**9)
+            yield f"{indent}{name}: {text.removesuffix('...' + chr(10)).strip()} # {field.description}"
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    try:
+        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise SettingsError(f"config {path}: {error.strerror or error}") from None
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+        raise SettingsError(f"config {path}: not a YAML file ({' '.join(str(error).split())})") from None
+    if values is None:
+        return {}
+    if not isinstance(values, dict):
+        raise SettingsError(f"config {path}: a mapping of parameters is needed")
+    numbers: dict[str, Any] = _number(values)
+    return numbers
+
+
+def _number(value: Any) -> Any:
+    """YAML 1.1 reads ``1e-3`` as a string; here it is the number it looks like."""
+    if isinstance(value, dict):
+        return {key: _number(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_number(item) for item in value]
+    if isinstance(value, str):
+        try:
+            return float(value)
+        except ValueError:
+            return value
+    return value
+
+
+def _check_groups(settings: type[Settings], values: Mapping[str, Any], prefix: str) -> None:
+    """Refuse unknown names and scalars where a group belongs, with the whole path in the message."""
+    for name, value in values.items():
+        field = settings.model_fields.get(name) if isinstance(name, str) else None
+        if field is None:
+            hint = nearest(str(name), settings.model_fields)
+            raise SettingsError(f"{prefix}{name} is not a parameter{hint}")
+        group = field.annotation
+        if isinstance(group, type) and issubclass(group, Settings):
+            if not isinstance(value, Mapping):
+                raise SettingsError(f"{prefix}{name} = {value!r}: a mapping of parameters is needed")
+            _check_groups(group, value, f"{prefix}{name}.")

@@ -1,0 +1,166 @@
+"""Saved policies: SB3's zip plus one JSON member, ``flock.json``, that tells the task, the learner and the versions.
+
+SB3 ignores the member, so ``DDPG.load`` reads our files as any other. :func:`load_policy` reads no pickle: it rebuilds the
+networks from the member's plain values and loads the tensors alone.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import zipfile
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+
+from sb3_flock.envs.flocking_v0 import action_space, observation_space
+from sb3_flock.rl.algorithms import ALGORITHMS, policy_kwargs
+from sb3_flock.rl.config import TrainingConfig
+from sb3_flock.settings import SettingsError
+from sb3_flock.sim import Scenario
+
+MEMBER = "flock.json"
+PACKAGES = ("sb3_flock", "stable_baselines3", "torch", "gymnasium", "pettingzoo", "supersuit", "numpy")
+
+
+class PolicyError(ValueError):
+    """A policy file cannot be used; one line for the user."""
+
+
+@dataclass(frozen=True)
+class FlockPolicyFile:
+    """A loaded policy and what its file tells of it."""
+
+    path: Path
+    policy: BasePolicy
+    config: TrainingConfig
+    versions: dict[str, str]
+    num_timesteps: int
+    parameters: dict[str, Any] = field(repr=False)
+    """The state dicts of the file's modules by name, as SB3's ``set_parameters`` takes them."""
+
+    @property
+    def scenario(self) -> Scenario:
+        """The task it was trained for."""
+        return self.config.scenario
+
+    def predict(
+        self, observation: np.ndarray, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[np.ndarray, Any]:
+        """SB3's ``predict``: tensors ``(vehicles, 3, l, l)`` (or one) to actions ``(vehicles, 2)`` [m/s, rad/s]."""
+        return self.policy.predict(observation, state, episode_start, deterministic)
+
+
+def versions() -> dict[str, str]:
+    """The versions of Python and of the packages that decide a run."""
+    return {"python": platform.python_version(), **{name: version(name) for name in PACKAGES}}
+
+
+def save_model(model: BaseAlgorithm, path: str | Path, config: TrainingConfig) -> Path:
+    """Save a model as SB3 does, with the JSON member, whole or not at all.
+
+    :param path: the zip to write
+    :return: the path
+    """
+    path = Path(path)
+    aside = path.with_name(f".{path.name}.tmp")
+    with open(aside, "wb") as file:
+        model.save(file)  # type: ignore[arg-type]
+    member = {
+        "format": 1,
+        "config": config.model_dump(mode="json"),
+        "num_timesteps": model.num_timesteps,
+        "versions": versions(),
+    }
+    with zipfile.ZipFile(aside, "a", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(MEMBER, json.dumps(member, indent=1))
+    with open(aside, "rb") as file:
+        os.fsync(file.fileno())
+    os.replace(aside, path)
+    return path
+
+
+def find_policy(path: str | Path) -> Path:
+    """The zip that a path means: itself, or a run folder's best (else final) model.
+
+    :raises PolicyError: if there is none
+    """
+    path = Path(path)
+    if path.is_dir():
+        for name in ("best_model.zip", "final_model.zip"):
+            if (path / name).is_file():
+                return path / name
+        raise PolicyError(f"{path}: no best_model.zip or final_model.zip in this folder")
+    if not path.is_file():
+        raise PolicyError(f"{path}: no such file or run folder")
+    return path
+
+
+def load_policy(path: str | Path, device: str = "cpu") -> FlockPolicyFile:
+    """Load a policy saved by a training run. No code from the file is run.
+
+    :param path: a zip or a run folder (its ``best_model.zip``)
+    :param device: torch device
+    :raises PolicyError: one line for a missing, damaged or foreign file
+    """
+    path = find_policy(path)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            member = json.loads(archive.read(MEMBER))
+            names = [name for name in archive.namelist() if name.endswith(".pth") and name != "pytorch_variables.pth"]
+            parameters = {}
+            for name in names:
+                with archive.open(name) as file:
+                    parameters[name.removesuffix(".pth")] = th.load(file, map_location=device, weights_only=True)
+    except KeyError:
+        raise PolicyError(f"{path}: not a policy of sb3_flock (it has no {MEMBER})") from None
+    except Exception as error:  # zipfile, json and torch raise many kinds for a damaged file; all mean the same here
+        raise PolicyError(f"{path}: damaged or not a policy file ({_first_line(error)})") from None
+    try:
+        config = TrainingConfig(**member["config"])
+        policy = _build_policy(config)
+        policy.load_state_dict(parameters["policy"])
+    except (SettingsError, KeyError, TypeError, RuntimeError, AttributeError) as error:
+        raise PolicyError(f"{path}: its networks do not fit what it says of itself ({_first_line(error)})") from None
+    if not all(bool(th.isfinite(tensor).all()) for tensor in policy.state_dict().values()):
+        raise PolicyError(f"{path}: its weights are not finite")
+    policy.to(device).set_training_mode(False)
+    return FlockPolicyFile(path, policy, config, member.get("versions", {}), member.get("num_timesteps", 0), parameters)
+
+
+def check_fit(policy: FlockPolicyFile, scenario: Scenario) -> None:
+    """Whether a policy can fly in a scenario.
+
+    :raises PolicyError: if its observation or action space differs, or the tensor has another meaning there
+    """
+    for name in ("n_anchors", "anchor_width", "max_speed", "max_turn_rate"):
+        theirs, here = getattr(policy.scenario, name), getattr(scenario, name)
+        if theirs != here:
+            raise PolicyError(f"{policy.path}: trained with {name} = {theirs}, but the scenario has {here}")
+    sensing = ("link_range", "detection_range", "channel_radii")
+    for name in sensing:
+        theirs, here = getattr(policy.scenario, name), getattr(scenario, name)
+        if theirs != here:
+            raise PolicyError(f"{policy.path}: its tensor means {name} = {theirs}, but the scenario has {here}")
+
+
+def _build_policy(config: TrainingConfig) -> BasePolicy:
+    _, policy_class = ALGORITHMS[config.algo]
+    return policy_class(
+        observation_space(config.scenario),
+        action_space(config.scenario),
+        lr_schedule=lambda _: 0.0,
+        **policy_kwargs(config.network),
+    )
+
+
+def _first_line(error: Exception) -> str:
+    lines = str(error).strip().splitlines()
+    return lines[0][:200] if lines else type(error).__name__

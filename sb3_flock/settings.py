@@ -1,0 +1,89 @@
+"""Settings: the base of every frozen, validated, self-describing group of parameters.
+
+A field's ``description`` (with its unit and source) is the only documentation of that parameter: the command line's
+``--help`` and the comments of every YAML file are made from it.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Mapping
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+_Settings = TypeVar("_Settings", bound="Settings")
+
+
+class SettingsError(ValueError):
+    """A parameter has a value that is not accepted; the message is one line for the user."""
+
+
+class Settings(BaseModel):
+    """Frozen, validated parameters that refuse unknown names.
+
+    :raises SettingsError: one line per wrong parameter, naming it, its value and what is accepted
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=False)
+
+    def __init__(self, **values: Any) -> None:
+        try:
+            super().__init__(**values)
+        except ValidationError as error:
+            raise SettingsError("; ".join(_describe(type(self), e) for e in error.errors())) from None
+
+    def replace(self: _Settings, **changes: Any) -> _Settings:
+        """A validated copy with some fields changed.
+
+        :raises SettingsError: for an unknown name or a value that is not accepted
+        """
+        return type(self)(**{**{name: getattr(self, name) for name in type(self).model_fields}, **changes})
+
+
+def leaf_paths(settings: type[Settings], prefix: tuple[str, ...] = ()) -> Iterable[tuple[str, ...]]:
+    """Every parameter of a settings class as a path of names, groups opened."""
+    for name, field in settings.model_fields.items():
+        if isinstance(field.annotation, type) and issubclass(field.annotation, Settings):
+            yield from leaf_paths(field.annotation, (*prefix, name))
+        else:
+            yield (*prefix, name)
+
+
+def resolve_path(settings: type[Settings], key: str) -> tuple[str, ...]:
+    """The parameter that ``key`` names; leading groups may be left out where no other parameter ends the same way.
+
+    >>> resolve_path(TrainingConfig, "reward.lambda_")  # doctest: +SKIP
+    ('scenario', 'reward', 'lambda_')
+
+    :raises SettingsError: for an unknown or ambiguous key
+    """
+    wanted = tuple(key.split("."))
+    paths = list(leaf_paths(settings))
+    if wanted in paths:
+        return wanted
+    hits = [path for path in paths if path[-len(wanted) :] == wanted]
+    if len(hits) == 1:
+        return hits[0]
+    if hits:
+        raise SettingsError(f"{key} is ambiguous: {', '.join('.'.join(path) for path in hits)}")
+    raise SettingsError(f"{key} is not a parameter{nearest(key, ['.'.join(path) for path in paths])}")
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """A hint ``; did you mean ...?`` for a mistyped name, or an empty string."""
+    by_tail = {candidate.split(".")[-1]: candidate for candidate in known}
+    by_tail.update({candidate: candidate for candidate in by_tail.values()})
+    close = difflib.get_close_matches(name, by_tail, n=1) or difflib.get_close_matches(name.split(".")[-1], by_tail, n=1)
+    return f"; did you mean {by_tail[close[0]]}?" if close else ""
+
+
+def _describe(settings: type[Settings], error: Mapping[str, Any]) -> str:
+    """One of pydantic's errors as ``parameter = value: what is accepted``."""
+    path = ".".join(str(part) for part in error["loc"]) or settings.__name__
+    if error["type"] == "extra_forbidden":
+        return f"{path} is not a parameter of {settings.__name__}{nearest(path, settings.model_fields)}"
+    if error["type"] == "value_error":  # raised by a validator of ours, which names the parameter itself
+        return str(error["ctx"]["error"])
+    message = error["msg"][0].lower() + error["msg"][1:]
+    return f"{path} = {error['input']!r}: {message}"

@@ -1,0 +1,19 @@
+"""The task itself: vehicles, obstacles, waypoint, what a vehicle senses and what it is paid for. NumPy only."""
+
+from sb3_flock.sim.observation import observe
+from sb3_flock.sim.reward import RewardWeights, mix_rewards, reward_terms
+from sb3_flock.sim.scenario import Scenario
+from sb3_flock.sim.sensing import Sensing, sense
+from sb3_flock.sim.world import World, episode_rng
+
+__all__ = [
+    "RewardWeights",
+    "Scenario",
+    "Sensing",
+    "World",
+    "episode_rng",
+    "mix_rewards",
+    "observe",
+    "reward_terms",
+    "sense",
+]

@@ -1,0 +1,73 @@
+"""The reward of section IV-B: four terms by name, their sum, and the neighbor-inclusive mix."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from pydantic import Field
+
+from sb3_flock.settings import Settings
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from sb3_flock.sim.scenario import Scenario
+    from sb3_flock.sim.sensing import Sensing
+
+
+class RewardWeights(Settings):
+    """The weights of the reward. Those the paper does not name are 1, its plain sum, in ``configs/paper_plain.yaml``."""
+
+    link_bonus: float = Field(1.0, ge=0, description="reward for each neighbor at a safe distance (paper, IV-B: 1)")
+    separation_penalty: float = Field(
+        1.0, ge=0, description="penalty for each neighbor nearer than neighbor_separation (paper, IV-B: 1)"
+    )
+    obstacle_penalty: float = Field(
+        1.0, ge=0, description="penalty for each obstacle nearer than obstacle_separation (paper, IV-B: 1)"
+    )
+    epsilon: float = Field(0.5, ge=0, description="weight of the distance to the waypoint [1/m] (paper leaves it open)")
+    beta: float = Field(
+        -0.01, le=0, description="weight of the squared action [m/s, rad/s], not positive (paper leaves it open)"
+    )
+    lambda_: float = Field(
+        0.7, ge=0, le=1, description="share of a vehicle's own reward in the mix with its neighbors' (open)"
+    )
+    scale: float = Field(1.0, gt=0, description="factor on the sum of the four terms (ours; paper: 1)")
+
+
+def reward_terms(sensing: Sensing, actions: NDArray[np.float64], scenario: Scenario) -> dict[str, NDArray[np.float64]]:
+    """The four terms of r_i, weighted and scaled, so that their sum is r_i.
+
+    :param sensing: what every vehicle senses after the step
+    :param actions: ``(flocks, vehicles, 2)`` [m/s, rad/s], the clipped actions that led there
+    :param scenario: ranges and weights
+    :return: ``connectivity``, ``obstacle``, ``waypoint`` and ``control``, each ``(flocks, vehicles)``
+    """
+    weights = scenario.reward
+    too_close = sensing.neighbor_distances < scenario.neighbor_separation
+    linked = sensing.neighbors & ~too_close
+    hit = sensing.obstacle_distances < scenario.obstacle_separation
+    terms = {
+        "connectivity": weights.link_bonus * linked.sum(-1) - weights.separation_penalty * too_close.sum(-1),
+        "obstacle": -weights.obstacle_penalty * hit.sum(-1),
+        "waypoint": -weights.epsilon * sensing.waypoint_distances,
+        "control": weights.beta * np.square(actions).sum(-1),
+    }
+    return {name: weights.scale * term for name, term in terms.items()}
+
+
+def mix_rewards(rewards: NDArray[np.floating], neighbors: NDArray[np.bool_], lambda_: float) -> NDArray[np.float64]:
+    """The neighbor-inclusive reward r_{i} = lambda r_i + (1 - lambda) mean of the neighbors' r_j (section IV-B).
+
+    A vehicle without neighbors keeps its own r_i, unscaled: scaling it would pay (or fine) it for being alone.
+
+    :param rewards: ``(..., vehicles)``
+    :param neighbors: ``(..., vehicles, vehicles)``, true where j is a neighbor of i
+    :param lambda_: share of the own reward, in [0, 1]
+    :return: ``(..., vehicles)``
+    """
+    own = np.asarray(rewards, dtype=np.float64)
+    count = neighbors.sum(-1)
+    others = np.where(neighbors, own[..., None, :], 0.0).sum(-1) / np.maximum(count, 1)
+    return np.where(count > 0, lambda_ * own + (1 - lambda_) * others, own)

@@ -1,0 +1,81 @@
+"""Scenario: every number of the task, with its unit and where it comes from."""
+
+from __future__ import annotations
+
+import math
+
+from pydantic import Field, model_validator
+
+from sb3_flock.settings import Settings
+from sb3_flock.sim.reward import RewardWeights
+
+
+class Scenario(Settings):
+    """The flocking task of Lyu et al. (2018), sections III to V.
+
+    Frozen; ``scenario.replace(n_vehicles=5)`` gives a changed copy. Lengths are in meters, times in seconds, angles in
+    radians; the paper's arena is 2 m wide.
+
+    :raises SettingsError: one line naming the parameter, its value and what is accepted
+    """
+
+    n_vehicles: int = Field(3, ge=1, description="number of vehicles n (paper, V: 3 or 5)")
+    n_obstacles: int = Field(1, ge=0, description="number of randomly walking obstacles (paper, V: 1 or 2)")
+    max_cycles: int = Field(200, ge=1, description="episode length T [steps] (paper leaves it open)")
+    time_step: float = Field(0.1, gt=0, description="sampling period [s] (paper, V)")
+
+    max_speed: float = Field(0.15, gt=0, description="top speed of a vehicle [m/s] (paper, V)")
+    max_turn_rate: float = Field(math.pi, gt=0, description="bound of a vehicle's turn rate omega [rad/s] (open)")
+    obstacle_max_speed: float = Field(0.1, ge=0, description="top speed of an obstacle [m/s] (paper, V)")
+    obstacle_turn_std: float = Field(
+        2.0, ge=0, description="standard deviation of an obstacle's turn rate, drawn each step [rad/s] (open)"
+    )
+    waypoint_speed: float = Field(0.1, ge=0, description="speed of the waypoint towards the origin [m/s] (paper, V)")
+
+    arena: float = Field(1.0, gt=0, description="half side of the square in which all bodies start [m] (paper, V)")
+    obstacle_arena: float = Field(
+        1.0, gt=0, description="half side of the square in which obstacles start and walk [m] (paper, V: the arena)"
+    )
+    link_range: float = Field(0.15, gt=0, description="proximity network threshold r_n [m] (paper, V)")
+    neighbor_separation: float = Field(0.1, ge=0, description="minimum separation to neighbors r_n' [m] (paper, V)")
+    detection_range: float = Field(0.25, gt=0, description="obstacle detection range r_o [m] (paper, V)")
+    obstacle_separation: float = Field(0.15, ge=0, description="minimum separation to obstacles r_o' [m] (paper, V)")
+
+    n_anchors: int = Field(11, ge=2, description="anchors per side l of each tensor channel (paper, IV-A: 11)")
+    neighbor_radius: float | None = Field(
+        None, gt=0, description="half width of the neighbor channel [m]; null: link_range (paper, IV-A: r_c)"
+    )
+    obstacle_radius: float | None = Field(
+        None, gt=0, description="half width of the obstacle channel [m]; null: detection_range (paper, IV-A)"
+    )
+    goal_radius: float = Field(
+        0.4, gt=0, description="half width r_g of the goal channel [m]; a farther waypoint shows on its circle (open)"
+    )
+    anchor_width: float = Field(
+        1.0, gt=0, description="standard deviation sigma of the anchors' Gaussian [anchor spacings] (open)"
+    )
+
+    reward: RewardWeights = Field(default_factory=RewardWeights, description="weights of the reward (paper, IV-B)")
+
+    @model_validator(mode="after")
+    def _ranges_fit(self) -> Scenario:
+        for near, far in (("neighbor_separation", "link_range"), ("obstacle_separation", "detection_range")):
+            if getattr(self, near) > getattr(self, far):
+                raise ValueError(
+                    f"{near} = {getattr(self, near)}: input should be at most {far} = {getattr(self, far)}"
+                )
+        return self
+
+    @property
+    def channel_radii(self) -> tuple[float, float, float]:
+        """Half width of the neighbor, the obstacle and the goal channel [m]."""
+        return (
+            self.link_range if self.neighbor_radius is None else self.neighbor_radius,
+            self.detection_range if self.obstacle_radius is None else self.obstacle_radius,
+            self.goal_radius,
+        )
+
+    @property
+    def observation_shape(self) -> tuple[int, int, int]:
+        """Shape of one vehicle's tensor, ``(3, l, l)``."""
+        return (3, self.n_anchors, self.n_anchors)

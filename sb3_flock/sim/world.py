@@ -1,0 +1,166 @@
+"""World: many flocks flown side by side as arrays (section III-A and V)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sb3_flock.sim.sensing import Sensing, sense
+
+if TYPE_CHECKING:
+    from numpy.random import Generator
+    from numpy.typing import ArrayLike, NDArray
+
+    from sb3_flock.sim.scenario import Scenario
+
+_MAX_REDRAWS = 1000
+"""Draws allowed for one body's start before the arena counts as too crowded."""
+
+
+class WorldError(ValueError):
+    """The scenario leaves no room to start; one line for the user."""
+
+
+def episode_rng(seed: int, episode: int) -> Generator:
+    """The random stream of one episode: it depends on the seed and the episode's number, never on how many fly at once."""
+    return np.random.default_rng(np.random.SeedSequence([seed, episode]))
+
+
+class World:
+    """``n_flocks`` independent flocks of one scenario, advanced in lockstep.
+
+    Every flock draws from its own generator, and a whole episode's obstacle walk is drawn at the reset: a flock's course
+    depends on its generator and its actions alone.
+
+    :param scenario: every number of the task
+    :param n_flocks: number of flocks, at least 1
+    """
+
+    positions: NDArray[np.float64]
+    """``(flocks, vehicles, 2)`` [m]."""
+    headings: NDArray[np.float64]
+    """``(flocks, vehicles)`` [rad], in [-pi, pi)."""
+    obstacle_positions: NDArray[np.float64]
+    """``(flocks, obstacles, 2)`` [m]."""
+    obstacle_headings: NDArray[np.float64]
+    """``(flocks, obstacles)`` [rad], in [-pi, pi)."""
+    waypoints: NDArray[np.float64]
+    """``(flocks, 2)`` [m]."""
+    steps: int
+    """Steps taken since the reset, k."""
+
+    def __init__(self, scenario: Scenario, n_flocks: int = 1) -> None:
+        self.scenario = scenario
+        self.n_flocks = n_flocks
+        self.action_low = np.array([0.0, -scenario.max_turn_rate])
+        self.action_high = np.array([scenario.max_speed, scenario.max_turn_rate])
+
+    def reset(self, rngs: Sequence[Generator]) -> Sensing:
+        """Start an episode in every flock (section V).
+
+        Vehicles and obstacles are uniform in their squares with uniform headings, the waypoint is uniform in the arena. A
+        body that starts closer to a vehicle than its minimum separation is drawn again.
+
+        :param rngs: one generator a flock
+        :return: what the vehicles sense at the start
+        :raises WorldError: if the arena is too crowded to place a body
+        """
+        if len(rngs) != self.n_flocks:
+            raise ValueError(f"rngs has {len(rngs)} generators: one for each of the {self.n_flocks} flocks is needed")
+        scenario = self.scenario
+        starts = [self._start(rng) for rng in rngs]
+        self.positions, self.headings, self.obstacle_positions, self.obstacle_headings, self.waypoints = (
+            np.stack(parts) for parts in zip(*starts, strict=True)
+        )
+        walk_shape = (scenario.max_cycles, scenario.n_obstacles)
+        walks = [
+            (rng.uniform(0.0, scenario.obstacle_max_speed, walk_shape), rng.normal(0.0, 1.0, walk_shape)) for rng in rngs
+        ]
+        self._walk_speeds = np.stack([speeds for speeds, _ in walks], axis=1)
+        self._walk_turns = np.stack([turns for _, turns in walks], axis=1) * scenario.obstacle_turn_std
+        self.steps = 0
+        return sense(self)
+
+    def step(self, actions: ArrayLike) -> tuple[Sensing, NDArray[np.float64]]:
+        """Move every body by one sampling period, vehicles, obstacles and waypoint together (section III-A).
+
+        :param actions: ``(flocks, vehicles, 2)``, speed v [m/s] and turn rate omega [rad/s], clipped to their bounds
+        :return: what the vehicles sense afterwards, and the clipped actions
+        :raises RuntimeError: before a reset or after the episode's last step
+        """
+        scenario = self.scenario
+        if not hasattr(self, "steps") or self.steps >= scenario.max_cycles:
+            raise RuntimeError("the episode is over or not begun: call reset() first")
+        clipped = np.clip(np.asarray(actions, dtype=np.float64), self.action_low, self.action_high)
+        dt = scenario.time_step
+        self.positions, self.headings = _unicycle(self.positions, self.headings, clipped[..., 0], clipped[..., 1], dt)
+        self._move_obstacles(dt)
+        distance = np.sqrt(np.square(self.waypoints).sum(-1, keepdims=True))
+        stride = scenario.waypoint_speed * dt
+        self.waypoints = self.waypoints * (1.0 - np.minimum(stride / np.maximum(distance, stride or 1.0), 1.0))
+        self.steps += 1
+        return sense(self), clipped
+
+    def _move_obstacles(self, dt: float) -> None:
+        """The random walk: a unicycle with drawn speed and turn rate, turned back at the edge of its square."""
+        bound = self.scenario.obstacle_arena
+        positions, headings = _unicycle(
+            self.obstacle_positions,
+            self.obstacle_headings,
+            self._walk_speeds[self.steps],
+            self._walk_turns[self.steps],
+            dt,
+        )
+        outside = (np.abs(positions) > bound).any(-1)
+        self.obstacle_positions = np.clip(positions, -bound, bound)
+        self.obstacle_headings = np.where(outside, wrap_angle(headings + np.pi), headings)
+
+    def _start(self, rng: Generator) -> tuple[NDArray[np.float64], ...]:
+        scenario = self.scenario
+        positions = np.empty((scenario.n_vehicles, 2))
+        for i in range(scenario.n_vehicles):
+            positions[i] = _draw_apart(
+                rng, scenario.arena, positions[:i], scenario.neighbor_separation, "n_vehicles", scenario.n_vehicles
+            )
+        obstacles = np.empty((scenario.n_obstacles, 2))
+        for o in range(scenario.n_obstacles):
+            obstacles[o] = _draw_apart(
+                rng, scenario.obstacle_arena, positions, scenario.obstacle_separation, "n_obstacles", scenario.n_obstacles
+            )
+        headings = rng.uniform(-np.pi, np.pi, scenario.n_vehicles)
+        obstacle_headings = rng.uniform(-np.pi, np.pi, scenario.n_obstacles)
+        waypoint = rng.uniform(-scenario.arena, scenario.arena, 2)
+        return positions, headings, obstacles, obstacle_headings, waypoint
+
+
+def _unicycle(
+    positions: NDArray[np.float64],
+    headings: NDArray[np.float64],
+    speeds: NDArray[np.float64],
+    turn_rates: NDArray[np.float64],
+    dt: float,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The discrete unicycle: position first, with the old heading, then the heading (section III-A)."""
+    stride = (speeds * dt)[..., None] * np.stack((np.cos(headings), np.sin(headings)), axis=-1)
+    return positions + stride, wrap_angle(headings + turn_rates * dt)
+
+
+def wrap_angle(angles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Angles in [-pi, pi) [rad]."""
+    return (angles + np.pi) % (2 * np.pi) - np.pi
+
+
+def _draw_apart(
+    rng: Generator, half_side: float, others: NDArray[np.float64], separation: float, name: str, count: int
+) -> NDArray[np.float64]:
+    """A point uniform in the square, drawn again while it is closer than ``separation`` to one of ``others``."""
+    for _ in range(_MAX_REDRAWS):
+        point = rng.uniform(-half_side, half_side, 2)
+        if not (np.square(others - point).sum(-1) < separation**2).any():
+            return point
+    raise WorldError(
+        f"{name} = {count}: no start at least {separation} m from the vehicles found in {_MAX_REDRAWS} draws "
+        f"from a square of half side {half_side} m; fewer bodies or a larger arena are needed"
+    )
