@@ -4,7 +4,7 @@
 Import                    ``from sb3_flock import flocking_v0`` or ``pettingzoo.make("parallel", "flock/flocking-v0")``
 Agents                    ``vehicle_0`` ... ``vehicle_{n-1}``; all live through the whole episode
 Actions                   continuous, ``Box([0, -pi], [0.15, pi], (2,))``: speed v [m/s] and turn rate omega [rad/s]
-Observations              ``Box(0, inf, (3, 11, 11), float32)``: neighbors, obstacles, waypoint in the body frame
+Observations              ``Box(0, 1e6, (3, 11, 11), float32)``: neighbors, obstacles, waypoint in the body frame
 Rewards                   r_i of section IV-B, without the neighbors' share (:func:`sb3_flock.sim.mix_rewards` mixes)
 Termination, truncation   never terminated; all agents are truncated after ``max_cycles`` steps
 Rendering                 ``human`` (a window; needs pygame) and ``rgb_array``
@@ -44,6 +44,7 @@ from pettingzoo.utils.conversions import parallel_to_aec
 
 from sb3_flock.settings import SettingsError
 from sb3_flock.sim import Scenario, Sensing, World, observe, reward_terms
+from sb3_flock.sim.scenario import MAX_BODIES
 from sb3_flock.sim.sensing import is_connected
 
 Observation = NDArray[np.float32]
@@ -61,8 +62,8 @@ def raw_env(**kwargs: Any) -> AECEnv:
 
 
 def observation_space(scenario: Scenario) -> spaces.Box:
-    """One vehicle's observation space; unbounded above, so that it fits any number of vehicles."""
-    return spaces.Box(0.0, np.inf, scenario.observation_shape, np.float32)
+    """One vehicle's observation space; the same for any number of vehicles, so that a policy fits them all."""
+    return spaces.Box(0.0, float(MAX_BODIES), scenario.observation_shape, np.float32)
 
 
 def action_space(scenario: Scenario) -> spaces.Box:

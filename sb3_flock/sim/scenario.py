@@ -9,6 +9,9 @@ from pydantic import Field, model_validator
 from sb3_flock.settings import Settings
 from sb3_flock.sim.reward import RewardWeights
 
+MAX_BODIES = 1_000_000
+"""Vehicles or obstacles at most. Each adds at most 1 to an anchor, so this bounds the tensor, whatever their number."""
+
 
 class Scenario(Settings):
     """The flocking task of Lyu et al. (2018), sections III to V.
@@ -19,8 +22,8 @@ class Scenario(Settings):
     :raises SettingsError: one line naming the parameter, its value and what is accepted
     """
 
-    n_vehicles: int = Field(3, ge=1, description="number of vehicles n (paper, V: 3 or 5)")
-    n_obstacles: int = Field(1, ge=0, description="number of randomly walking obstacles (paper, V: 1 or 2)")
+    n_vehicles: int = Field(3, ge=1, le=MAX_BODIES, description="number of vehicles n (paper, V: 3 or 5)")
+    n_obstacles: int = Field(1, ge=0, le=MAX_BODIES, description="number of randomly walking obstacles (paper, V: 1 or 2)")
     max_cycles: int = Field(200, ge=1, description="episode length T [steps] (paper leaves it open)")
     time_step: float = Field(0.1, gt=0, description="sampling period [s] (paper, V)")
 
