@@ -74,7 +74,8 @@ def nearest(name: str, known: Iterable[str]) -> str:
     """A hint ``; did you mean ...?`` for a mistyped name, or an empty string."""
     by_tail = {candidate.split(".")[-1]: candidate for candidate in known}
     by_tail.update({candidate: candidate for candidate in by_tail.values()})
-    close = difflib.get_close_matches(name, by_tail, n=1) or difflib.get_close_matches(name.split(".")[-1], by_tail, n=1)
+    tail = name.rsplit(".", maxsplit=1)[-1]
+    close = difflib.get_close_matches(name, by_tail, n=1) or difflib.get_close_matches(tail, by_tail, n=1)
     return f"; did you mean {by_tail[close[0]]}?" if close else ""
 
 

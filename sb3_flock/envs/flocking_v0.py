@@ -43,7 +43,7 @@ from pettingzoo.utils import wrappers
 from pettingzoo.utils.conversions import parallel_to_aec
 
 from sb3_flock.settings import SettingsError
-from sb3_flock.sim import Scenario, Sensing, World, observe, reward_terms
+from sb3_flock.sim import Scenario, Sensing, World, observe, own_reward, reward_terms, sense
 from sb3_flock.sim.scenario import MAX_BODIES
 from sb3_flock.sim.sensing import is_connected
 
@@ -126,18 +126,15 @@ class parallel_env(ParallelEnv[str, Observation, Action]):  # noqa: N801 - Petti
 
     def step(
         self, actions: dict[str, Action]
-    ) -> tuple[
-        dict[str, Observation], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]
-    ]:
+    ) -> tuple[dict[str, Observation], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
         """Move everything by one sampling period; see the module's page for what comes back."""
         sensing, clipped = self.world.step([[actions[agent] for agent in self.agents]])
         terms = {name: term[0] for name, term in reward_terms(sensing, clipped, self.scenario).items()}
-        rewards = sum(terms.values())
         truncated = self.world.steps >= self.scenario.max_cycles
         infos = self._infos(sensing, terms, truncated)
         result = (
             self._observations(sensing),
-            dict(zip(self.agents, rewards.tolist(), strict=True)),
+            dict(zip(self.agents, own_reward(terms).tolist(), strict=True)),
             dict.fromkeys(self.agents, False),
             dict.fromkeys(self.agents, truncated),
             infos,
@@ -163,8 +160,6 @@ class parallel_env(ParallelEnv[str, Observation, Action]):  # noqa: N801 - Petti
 
     def state(self) -> NDArray[np.float32]:
         """All vehicles' observations stacked, ``(vehicles, 3, l, l)``."""
-        from sb3_flock.sim import sense
-
         return observe(sense(self.world), self.scenario)[0]
 
     def close(self) -> None:
@@ -176,9 +171,7 @@ class parallel_env(ParallelEnv[str, Observation, Action]):  # noqa: N801 - Petti
     def _observations(self, sensing: Sensing) -> dict[str, Observation]:
         return dict(zip(self.possible_agents, observe(sensing, self.scenario)[0], strict=True))
 
-    def _infos(
-        self, sensing: Sensing, terms: dict[str, NDArray[np.float64]], truncated: bool
-    ) -> dict[str, dict[str, Any]]:
+    def _infos(self, sensing: Sensing, terms: dict[str, NDArray[np.float64]], truncated: bool) -> dict[str, dict[str, Any]]:
         scenario = self.scenario
         nearest_neighbor = sensing.neighbor_distances[0].min(-1, initial=np.inf)
         nearest_obstacle = sensing.obstacle_distances[0].min(-1, initial=np.inf)

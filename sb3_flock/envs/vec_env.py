@@ -200,7 +200,7 @@ class ParameterSharingVecEnv(SB3VecEnvWrapper):
 
     def getattr_recursive(self, name: str) -> Any:
         """Let SB3's wrappers around this one see its attributes."""
-        return getattr(self, name)
+        return object.__getattribute__(self, name)  # not getattr: SB3 falls back to this method
 
     def _copies(self, indices: Any) -> Iterable[ParallelEnv]:
         if self._has_workers:

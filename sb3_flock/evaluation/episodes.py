@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sb3_flock.evaluation.metrics import EpisodeMetrics, Metric, summarize
 from sb3_flock.settings import SettingsError
-from sb3_flock.sim import Scenario, Sensing, World, episode_rng, observe, reward_terms
+from sb3_flock.sim import Scenario, Sensing, World, episode_rng, observe, own_reward, reward_terms
 
 BATCH = 250
 """Episodes flown at once; it bounds the memory and changes no number."""
@@ -76,7 +76,7 @@ def fly(
         sensing = world.reset([episode_rng(seed, episode) for episode in numbers])
         for _ in range(scenario.max_cycles):
             sensing, clipped = world.step(controller.act(sensing, scenario))
-            metrics.update(sensing, sum(reward_terms(sensing, clipped, scenario).values()))
+            metrics.update(sensing, own_reward(reward_terms(sensing, clipped, scenario)))
         results.append(metrics.result())
         if on_batch is not None:
             on_batch(numbers.stop)
@@ -94,9 +94,12 @@ def evaluate(
     :param seed: episode e draws from ``SeedSequence([seed, e])``
     :return: every metric of :data:`~sb3_flock.evaluation.METRICS` by name
     :raises SettingsError: for counts that are not accepted, or without a scenario
+    :raises PolicyError: if a loaded policy's tensor has another shape; it warns where the tensor means something else
     """
     scenario = scenario or getattr(policy, "scenario", None)
     if scenario is None:
         raise SettingsError("scenario = None: the policy carries none, so one is needed")
+    if hasattr(policy, "check"):
+        policy.check(scenario)
     controller = policy if hasattr(policy, "act") else PolicyController(policy)
     return summarize(fly(controller, scenario, episodes, seed, batch))

@@ -25,7 +25,7 @@ METRICS = {
     "obstacle_violation_rate": "share of vehicle-steps with an obstacle closer than its minimum separation",
     "neighbor_violation_rate": "share of vehicle-steps with a vehicle closer than its minimum separation",
     "connectivity": "share of settled steps whose proximity graph is connected",
-    "success_rate": "share of episodes without a violation that end connected, every vehicle within link range of the waypoint",
+    "success_rate": "share of episodes without violation that end connected, each vehicle within link range of the waypoint",
     "return": "undiscounted sum of a vehicle's own reward, mean over vehicles",
 }
 """Every metric by name, in the order of the tables."""

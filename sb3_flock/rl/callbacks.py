@@ -117,7 +117,7 @@ class FadingNoise(BaseCallback):
         return True
 
     def _on_rollout_start(self) -> None:
-        noise = self.model.action_noise  # type: ignore[attr-defined]
+        noise = self.model.action_noise
         sigma = self.end + (self.start - self.end) * self.model._current_progress_remaining
         for part in noise.noises if isinstance(noise, VectorizedActionNoise) else [noise]:
             if isinstance(part, NormalActionNoise):

@@ -6,6 +6,7 @@ from typing import Any
 
 import torch as th
 from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
+from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_mlp
 from stable_baselines3.sac.policies import SACPolicy
 from stable_baselines3.td3.policies import TD3Policy
@@ -27,7 +28,7 @@ class ActionLayerCritic(ContinuousCritic):
 
     def __init__(self, *args: Any, action_layer: int = 32, final_init: float | None = 3e-3, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        action_dim = int(self.action_space.shape[0])
+        action_dim = get_action_dim(self.action_space)
         features_dim, net_arch = kwargs["features_dim"], kwargs["net_arch"]
         activation_fn = kwargs.get("activation_fn", nn.ReLU)
         self.action_layers = nn.ModuleList()
@@ -64,6 +65,7 @@ def init_output_layer(network: nn.Module, bound: float | None) -> None:
 
 
 class _FlockPolicyMixin(BasePolicy):
+    critic_kwargs: dict[str, Any]
     """What the policies below share: :class:`FlockCNN`, :class:`ActionLayerCritic` and small output layers."""
 
     def __init__(
@@ -75,7 +77,7 @@ class _FlockPolicyMixin(BasePolicy):
         net_arch: list[int] | dict[str, list[int]] | None = None,
         **kwargs: Any,
     ) -> None:
-        self._action_layer_kwargs = {"action_layer": action_layer, "final_init": final_init}
+        self._action_layer_kwargs: dict[str, Any] = {"action_layer": action_layer, "final_init": final_init}
         super().__init__(
             *args,
             features_extractor_class=features_extractor_class,

@@ -63,7 +63,7 @@ class FlockProgress(BaseCallback):
         now = time.monotonic()
         if now - self._last > 0.5:
             self._last = now
-            self._marks.append((now, self.num_timesteps, self.model._n_updates))  # type: ignore[attr-defined]
+            self._marks.append((now, self.num_timesteps, self.model._n_updates))
             self._bar.update(self._task, completed=min(self.num_timesteps, self.total_timesteps))
             if self._live is not None:
                 self._live.update(self._panel())

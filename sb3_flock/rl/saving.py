@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import platform
+import warnings
 import zipfile
 from dataclasses import dataclass, field
 from importlib.metadata import version
@@ -35,7 +36,7 @@ class PolicyError(ValueError):
 
 
 @dataclass(frozen=True)
-class FlockPolicyFile:
+class LoadedPolicy:
     """A loaded policy and what its file tells of it."""
 
     path: Path
@@ -50,6 +51,20 @@ class FlockPolicyFile:
     def scenario(self) -> Scenario:
         """The task it was trained for."""
         return self.config.scenario
+
+    def check(self, scenario: Scenario) -> None:
+        """Whether it can fly in a scenario. Warns where the same tensor or action means something else there.
+
+        :raises PolicyError: if its tensor has another shape
+        """
+        if scenario.n_anchors != self.scenario.n_anchors:
+            raise PolicyError(
+                f"{self.path}: it sees {self.scenario.n_anchors} anchors a side, but the scenario has {scenario.n_anchors}"
+            )
+        for name in ("link_range", "detection_range", "channel_radii", "anchor_width", "max_speed", "max_turn_rate"):
+            trained, flown = getattr(self.scenario, name), getattr(scenario, name)
+            if trained != flown:
+                warnings.warn(f"{self.path}: trained with {name} = {trained}, flown with {flown}", stacklevel=2)
 
     def predict(
         self, observation: np.ndarray, state: Any = None, episode_start: Any = None, deterministic: bool = True
@@ -72,7 +87,7 @@ def save_model(model: BaseAlgorithm, path: str | Path, config: TrainingConfig) -
     path = Path(path)
     aside = path.with_name(f".{path.name}.tmp")
     with open(aside, "wb") as file:
-        model.save(file)  # type: ignore[arg-type]
+        model.save(file)
     member = {
         "format": 1,
         "config": config.model_dump(mode="json"),
@@ -103,7 +118,7 @@ def find_policy(path: str | Path) -> Path:
     return path
 
 
-def load_policy(path: str | Path, device: str = "cpu") -> FlockPolicyFile:
+def load_policy(path: str | Path, device: str = "cpu") -> LoadedPolicy:
     """Load a policy saved by a training run. No code from the file is run.
 
     :param path: a zip or a run folder (its ``best_model.zip``)
@@ -132,23 +147,7 @@ def load_policy(path: str | Path, device: str = "cpu") -> FlockPolicyFile:
     if not all(bool(th.isfinite(tensor).all()) for tensor in policy.state_dict().values()):
         raise PolicyError(f"{path}: its weights are not finite")
     policy.to(device).set_training_mode(False)
-    return FlockPolicyFile(path, policy, config, member.get("versions", {}), member.get("num_timesteps", 0), parameters)
-
-
-def check_fit(policy: FlockPolicyFile, scenario: Scenario) -> None:
-    """Whether a policy can fly in a scenario.
-
-    :raises PolicyError: if its observation or action space differs, or the tensor has another meaning there
-    """
-    for name in ("n_anchors", "anchor_width", "max_speed", "max_turn_rate"):
-        theirs, here = getattr(policy.scenario, name), getattr(scenario, name)
-        if theirs != here:
-            raise PolicyError(f"{policy.path}: trained with {name} = {theirs}, but the scenario has {here}")
-    sensing = ("link_range", "detection_range", "channel_radii")
-    for name in sensing:
-        theirs, here = getattr(policy.scenario, name), getattr(scenario, name)
-        if theirs != here:
-            raise PolicyError(f"{policy.path}: its tensor means {name} = {theirs}, but the scenario has {here}")
+    return LoadedPolicy(path, policy, config, member.get("versions", {}), member.get("num_timesteps", 0), parameters)
 
 
 def _build_policy(config: TrainingConfig) -> BasePolicy:

@@ -115,7 +115,7 @@ class Evaluation(BaseCallback):
         self.config, self.folder, self.progress = config, folder, progress
         self.best_score = np.inf
         self._due = config.eval_freq
-        self._history: dict[str, list[Any]] = {"timesteps": [], "results": [], "ep_lengths": [], "score": []}
+        self._history: dict[str, list[Any]] = {"timesteps": [], "results": [], "ep_lengths": []}
 
     def _on_step(self) -> bool:
         return True
@@ -132,18 +132,16 @@ class Evaluation(BaseCallback):
     def _evaluate(self) -> None:
         config = self.config
         values = fly(PolicyController(self.model), config.scenario, config.eval_episodes, SELECTION_SEED)
-        means = {
-            name: float(np.nanmean(value)) if not np.isnan(value).all() else np.nan for name, value in values.items()
-        }
+        means = {name: float(np.nanmean(value)) if not np.isnan(value).all() else np.nan for name, value in values.items()}
         current = score(means)
         for name, mean in {**means, "score": current}.items():
             self.logger.record(f"eval/{name}", mean)
-            self._history.setdefault(name, []).append(mean) if name != "score" else None
+            self._history.setdefault(name, []).append(mean)
         self._history["timesteps"].append(self.num_timesteps)
         self._history["results"].append(values["return"])
         self._history["ep_lengths"].append([config.scenario.max_cycles] * config.eval_episodes)
-        self._history["score"].append(current)
-        np.savez(self.folder / "evaluations.npz", **{name: np.asarray(rows) for name, rows in self._history.items()})
+        history: dict[str, Any] = {name: np.asarray(rows) for name, rows in self._history.items()}
+        np.savez(self.folder / "evaluations.npz", **history)
         is_best = current < self.best_score
         if is_best:
             self.best_score = current

@@ -1,7 +1,7 @@
 """The task itself: vehicles, obstacles, waypoint, what a vehicle senses and what it is paid for. NumPy only."""
 
 from sb3_flock.sim.observation import observe
-from sb3_flock.sim.reward import RewardWeights, mix_rewards, reward_terms
+from sb3_flock.sim.reward import RewardWeights, mix_rewards, own_reward, reward_terms
 from sb3_flock.sim.scenario import Scenario
 from sb3_flock.sim.sensing import Sensing, sense
 from sb3_flock.sim.world import World, episode_rng
@@ -14,6 +14,7 @@ __all__ = [
     "episode_rng",
     "mix_rewards",
     "observe",
+    "own_reward",
     "reward_terms",
     "sense",
 ]

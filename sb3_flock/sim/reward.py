@@ -57,6 +57,11 @@ def reward_terms(sensing: Sensing, actions: NDArray[np.float64], scenario: Scena
     return {name: weights.scale * term for name, term in terms.items()}
 
 
+def own_reward(terms: dict[str, NDArray[np.float64]]) -> NDArray[np.float64]:
+    """r_i, the sum of its terms (section IV-B)."""
+    return np.add.reduce(list(terms.values()))
+
+
 def mix_rewards(rewards: NDArray[np.floating], neighbors: NDArray[np.bool_], lambda_: float) -> NDArray[np.float64]:
     """The neighbor-inclusive reward r_{i} = lambda r_i + (1 - lambda) mean of the neighbors' r_j (section IV-B).
 

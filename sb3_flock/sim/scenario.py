@@ -64,9 +64,7 @@ class Scenario(Settings):
     def _ranges_fit(self) -> Scenario:
         for near, far in (("neighbor_separation", "link_range"), ("obstacle_separation", "detection_range")):
             if getattr(self, near) > getattr(self, far):
-                raise ValueError(
-                    f"{near} = {getattr(self, near)}: input should be at most {far} = {getattr(self, far)}"
-                )
+                raise ValueError(f"{near} = {getattr(self, near)}: input should be at most {far} = {getattr(self, far)}")
         return self
 
     @property

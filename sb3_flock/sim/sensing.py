@@ -67,9 +67,7 @@ def _norm(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.sqrt(np.square(vectors[..., 0]) + np.square(vectors[..., 1]))
 
 
-def _to_body(
-    offsets: NDArray[np.float64], cos: NDArray[np.float64], sin: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _to_body(offsets: NDArray[np.float64], cos: NDArray[np.float64], sin: NDArray[np.float64]) -> NDArray[np.float64]:
     """Rotate world offsets into the body frame: x_ij = R(theta_i) (x_j - x_i), R the rotation into the frame."""
     x, y = offsets[..., 0], offsets[..., 1]
     return np.stack((cos * x + sin * y, cos * y - sin * x), axis=-1)
@@ -86,4 +84,4 @@ def is_connected(neighbors: NDArray[np.bool_]) -> NDArray[np.bool_]:
     while length < neighbors.shape[-1] - 1:
         reached = np.matmul(reached, reached)
         length *= 2
-    return reached[..., 0, :].all(-1)
+    return np.asarray(reached[..., 0, :].all(-1))

@@ -1,0 +1,129 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sb3_flock.sim import Scenario, World, episode_rng
+from sb3_flock.sim.world import WorldError
+
+
+def test_the_position_moves_with_the_old_heading_then_the_heading_turns(scenario, place):
+    world = place(scenario, [(0.0, 0.0), (0.5, 0.5), (-0.5, 0.2)], [0.0, np.pi / 2, np.pi])
+    world.step([[[0.1, 1.0], [0.15, -2.0], [0.0, 3.0]]])
+    np.testing.assert_allclose(world.positions[0], [(0.01, 0.0), (0.5, 0.515), (-0.5, 0.2)], atol=1e-15)
+    np.testing.assert_allclose(world.headings[0], [0.1, np.pi / 2 - 0.2, -np.pi + 0.3], atol=1e-12)
+
+
+def test_actions_are_clipped_to_their_bounds(scenario, place):
+    world = place(scenario, [(0.0, 0.0), (0.5, 0.0), (0.9, 0.0)], [0.0, 0.0, 0.0])
+    _, clipped = world.step([[[9.0, 9.0], [-9.0, -9.0], [0.1, 1.0]]])
+    np.testing.assert_allclose(clipped[0], [(0.15, np.pi), (0.0, -np.pi), (0.1, 1.0)])
+    np.testing.assert_allclose(world.positions[0, :, 0], [0.015, 0.5, 0.91])
+
+
+def test_the_waypoint_heads_for_the_origin_and_stays_there(scenario, place):
+    world = place(scenario, [(0.5, 0.5)], [0.0], waypoint=(0.03, 0.04))
+    seen = []
+    for _ in range(7):
+        world.step(np.zeros((1, 1, 2)))
+        seen.append(np.linalg.norm(world.waypoints[0]))
+    np.testing.assert_allclose(seen, [0.04, 0.03, 0.02, 0.01, 0.0, 0.0, 0.0], atol=1e-12)
+    assert np.isfinite(world.waypoints).all()
+
+
+def test_a_waypoint_on_the_origin_or_without_speed_stays(scenario, place):
+    world = place(scenario.replace(waypoint_speed=0.0), [(0.5, 0.5)], [0.0], waypoint=(0.3, 0.4))
+    world.step(np.zeros((1, 1, 2)))
+    np.testing.assert_array_equal(world.waypoints[0], (0.3, 0.4))
+    world.waypoints = np.zeros((1, 2))
+    world.step(np.zeros((1, 1, 2)))
+    np.testing.assert_array_equal(world.waypoints[0], (0.0, 0.0))
+
+
+def test_an_obstacle_walks_as_a_unicycle_and_turns_back_at_the_edge(scenario, place):
+    world = place(scenario, [(0.0, 0.0)], [0.0], obstacles=[(0.0, 0.5), (0.999, 0.0)])
+    world.obstacle_headings = np.array([[np.pi / 2, 0.0]])
+    world._walk_speeds[0] = [[0.05, 0.1]]
+    world._walk_turns[0] = [[1.0, 0.5]]
+    world.step(np.zeros((1, 1, 2)))
+    np.testing.assert_allclose(world.obstacle_positions[0], [(0.0, 0.505), (1.0, 0.0)], atol=1e-12)
+    np.testing.assert_allclose(world.obstacle_headings[0], [np.pi / 2 + 0.1, 0.05 - np.pi], atol=1e-12)
+
+
+def test_the_walk_has_the_stated_distribution():
+    scenario = Scenario(n_vehicles=1, n_obstacles=50)
+    world = World(scenario, 20)
+    world.reset([episode_rng(1, e) for e in range(20)])
+    assert world._walk_speeds.min() >= 0
+    assert world._walk_speeds.max() <= scenario.obstacle_max_speed
+    assert world._walk_speeds.mean() == pytest.approx(0.05, rel=0.01)
+    assert world._walk_turns.std() == pytest.approx(2.0, rel=0.01)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**31), st.integers(1, 12), st.integers(0, 6))
+def test_starts_lie_in_their_squares_and_keep_their_separations(seed, n_vehicles, n_obstacles):
+    scenario = Scenario(n_vehicles=n_vehicles, n_obstacles=n_obstacles, obstacle_arena=0.7)
+    world = World(scenario)
+    sensing = world.reset([episode_rng(seed, 0)])
+    assert np.abs(world.positions).max() <= 1.0
+    assert np.abs(world.waypoints).max() <= 1.0
+    assert np.abs(world.obstacle_positions).max(initial=0.0) <= 0.7
+    assert sensing.neighbor_distances.min() >= scenario.neighbor_separation
+    assert sensing.obstacle_distances.min(initial=np.inf) >= scenario.obstacle_separation
+
+
+def test_a_crowded_arena_is_a_clear_error():
+    with pytest.raises(WorldError, match=r"n_vehicles = 500: no start at least 0\.1 m"):
+        World(Scenario(n_vehicles=500)).reset([episode_rng(0, 0)])
+    with pytest.raises(WorldError, match="n_obstacles = 1"):
+        World(Scenario(n_vehicles=30, n_obstacles=1, arena=0.5, obstacle_arena=0.01)).reset([episode_rng(0, 0)])
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**31))
+def test_nothing_exceeds_its_speed_and_obstacles_stay_in(seed):
+    scenario = Scenario(n_vehicles=4, n_obstacles=3, obstacle_arena=0.5, max_cycles=40)
+    world = World(scenario, 2)
+    world.reset([episode_rng(seed, e) for e in range(2)])
+    rng = np.random.default_rng(seed)
+    for _ in range(scenario.max_cycles):
+        before, obstacles, waypoints = world.positions, world.obstacle_positions, world.waypoints
+        world.step(rng.normal(0, 5, (2, 4, 2)))
+        assert np.linalg.norm(world.positions - before, axis=-1).max() <= 0.015 + 1e-12
+        assert np.linalg.norm(world.obstacle_positions - obstacles, axis=-1).max() <= 0.01 + 1e-12
+        assert np.linalg.norm(world.waypoints - waypoints, axis=-1).max() <= 0.01 + 1e-12
+        assert np.abs(world.obstacle_positions).max() <= 0.5
+        assert (np.abs(world.headings) <= np.pi).all()
+
+
+def test_a_flocks_course_does_not_depend_on_the_flocks_beside_it():
+    scenario = Scenario(n_vehicles=5, n_obstacles=2, max_cycles=30)
+    actions = np.random.default_rng(0).uniform(-1, 1, (30, 4, 5, 2))
+    together = World(scenario, 4)
+    together.reset([episode_rng(3, e) for e in range(4)])
+    alone = [World(scenario) for _ in range(4)]
+    for e, world in enumerate(alone):
+        world.reset([episode_rng(3, e)])
+    for step in actions:
+        together.step(step)
+        for e, world in enumerate(alone):
+            world.step(step[e : e + 1])
+            np.testing.assert_array_equal(world.positions[0], together.positions[e])
+            np.testing.assert_array_equal(world.obstacle_positions[0], together.obstacle_positions[e])
+            np.testing.assert_array_equal(world.headings[0], together.headings[e])
+
+
+def test_stepping_without_a_reset_or_past_the_end_is_an_error():
+    world = World(Scenario(max_cycles=1))
+    with pytest.raises(RuntimeError, match="reset"):
+        world.step(np.zeros((1, 3, 2)))
+    world.reset([episode_rng(0, 0)])
+    world.step(np.zeros((1, 3, 2)))
+    with pytest.raises(RuntimeError, match="reset"):
+        world.step(np.zeros((1, 3, 2)))
+
+
+def test_every_flock_needs_its_generator():
+    with pytest.raises(ValueError, match="rngs has 1 generators"):
+        World(Scenario(), 2).reset([episode_rng(0, 0)])
