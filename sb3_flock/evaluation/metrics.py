@@ -77,7 +77,8 @@ class EpisodeMetrics:
         self.settled_steps += 1
         sums["settled_distance"] += distances.sum(-1)
         first, second = np.triu_indices(scenario.n_vehicles, k=1)
-        pairs = sensing.neighbor_distances[:, first, second]
+        # Contiguous, so that NumPy adds the pairs up in the same order however many flocks there are.
+        pairs = np.ascontiguousarray(sensing.neighbor_distances[:, first, second])
         linked = sensing.neighbors[:, first, second]
         sums["pair"] += pairs.sum(-1)
         sums["linked"] += np.where(linked, pairs, 0.0).sum(-1)

@@ -7,6 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from rich import box
 from rich.table import Table
 
 from sb3_flock.evaluation.metrics import METRICS, MINIMA, Metric
@@ -52,14 +53,14 @@ _RATES = ("obstacle_violation_rate", "neighbor_violation_rate", "connectivity", 
 def metrics_table(metrics: dict[str, Metric], scenario: Scenario, title: str) -> Table:
     """All metrics with their intervals, beside the paper's figures where it has some for as many vehicles and obstacles."""
     paper = PAPER.get((scenario.n_vehicles, scenario.n_obstacles), {})
-    table = Table(title=title, title_justify="left", title_style="bold")
+    table = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
     table.add_column("metric", no_wrap=True)
     for heading in ("mean", "95 % interval", "worst", *(f"paper {name.removeprefix('Table ')}" for name in paper)):
         table.add_column(heading, justify="right", no_wrap=True)
     for name in METRICS:
         metric = metrics[name]
         cells = [_number(name, metric.mean)]
-        cells.append(f"{_number(name, metric.low)} .. {_number(name, metric.high)}" if metric.n else "")
+        cells.append(f"{_number(name, metric.low).rstrip('%')} .. {_number(name, metric.high)}" if metric.n else "")
         cells.append(_number(name, metric.worst) if name in MINIMA and metric.n else "")
         cells += [_number(name, row[name]) if name in row else "" for row in paper.values()]
         table.add_row(name.replace("encounter_min_separation", "encounter_min_sep"), *cells)

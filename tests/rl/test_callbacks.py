@@ -1,0 +1,156 @@
+import numpy as np
+import pytest
+from mpe2 import simple_spread_v3
+from stable_baselines3 import DDPG
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
+
+from sb3_flock import FlockCNN, NeighborInclusiveReward, Scenario, flatten, make_vec_env
+from sb3_flock.rl.callbacks import FadingNoise, FlockMetrics
+from sb3_flock.settings import SettingsError
+
+CROWDED = Scenario(n_vehicles=4, n_obstacles=1, arena=0.2, obstacle_arena=0.4, neighbor_separation=0.02, max_cycles=5)
+
+
+class Record(BaseCallback):
+    """Keeps every step's rewards, infos and dones as the callbacks before it left them."""
+
+    def __init__(self):
+        super().__init__()
+        self.steps = []
+
+    def _on_step(self):
+        self.steps.append((self.locals["rewards"].copy(), self.locals["infos"], self.locals["dones"].copy()))
+        return True
+
+
+def learn(env, callbacks, steps, extractor=None, **kwargs):
+    policy_kwargs = {"net_arch": [8], **({"features_extractor_class": extractor} if extractor else {})}
+    model = DDPG(
+        "MlpPolicy",
+        env,
+        policy_kwargs=policy_kwargs,
+        learning_starts=10**9,
+        buffer_size=2000,
+        device="cpu",
+        seed=0,
+        **kwargs,
+    )
+    model.learn(steps * env.num_envs, callback=callbacks)
+    return model
+
+
+def expected_mix(infos, n_agents, lambda_):
+    """The mix by the formula, one slot at a time, from the raw rewards that the infos keep."""
+    mixed = []
+    for slot, info in enumerate(infos):
+        first = slot - slot % n_agents
+        others = [infos[first + j]["reward"] for j in info["neighbors"]]
+        own = info["reward"]
+        mixed.append(lambda_ * own + (1 - lambda_) * np.mean(others) if others else own)
+    return mixed
+
+
+def test_the_mixed_reward_reaches_the_replay_buffer_and_the_raw_one_stays():
+    env = VecMonitor(make_vec_env(CROWDED, n_flocks=2, seed=1))
+    record = Record()
+    model = learn(env, [NeighborInclusiveReward(0.7), record], 12, FlockCNN)
+    mixes = 0
+    for step, (_, infos, _) in enumerate(record.steps):
+        raw = [sum(info["reward_terms"].values()) for info in infos]
+        np.testing.assert_allclose([info["reward"] for info in infos], raw, rtol=1e-5)
+        stored = model.replay_buffer.rewards[step]
+        np.testing.assert_allclose(stored, expected_mix(infos, 4, 0.7), rtol=1e-5)
+        mixes += int((np.abs(stored - raw) > 1e-6).sum())
+    assert mixes > 20
+    raw_returns = [sum(infos[0]["reward"] for _, infos, _ in record.steps[:5])]
+    assert model.ep_info_buffer[0]["r"] == pytest.approx(raw_returns[0], rel=1e-4)
+
+
+def test_neighbors_at_the_end_of_an_episode_are_those_of_its_last_step():
+    record = Record()
+    model = learn(make_vec_env(CROWDED, n_flocks=2, seed=2), [NeighborInclusiveReward(0.5), record], 10, FlockCNN)
+    _, infos, dones = record.steps[4]
+    assert dones.all()
+    np.testing.assert_allclose(model.replay_buffer.rewards[4], expected_mix(infos, 4, 0.5), rtol=1e-5)
+
+
+def test_it_works_with_n_step_returns():
+    record = Record()
+    model = learn(make_vec_env(CROWDED, n_flocks=1, seed=3), [NeighborInclusiveReward(0.5), record], 5, FlockCNN, n_steps=3)
+    np.testing.assert_allclose(model.replay_buffer.rewards[2], expected_mix(record.steps[2][1], 4, 0.5), rtol=1e-5)
+
+
+
+def spread_env():
+    from pettingzoo.utils import BaseParallelWrapper
+
+    class NeighborContract(BaseParallelWrapper):
+        def step(self, actions):
+            observations, rewards, terminations, truncations, infos = super().step(actions)
+            if not observations:
+                return observations, rewards, terminations, truncations, infos
+            positions = np.array([observations[agent][2:4] for agent in self.possible_agents])
+            distances = np.linalg.norm(positions[:, None] - positions[None], axis=-1) + np.diag([np.inf] * len(positions))
+            for i, agent in enumerate(self.possible_agents):
+                infos[agent] = {**infos[agent], "neighbors": np.flatnonzero(distances[i] < 1.0)}
+            return observations, rewards, terminations, truncations, infos
+
+    return NeighborContract(simple_spread_v3.parallel_env(N=3, local_ratio=1.0, max_cycles=8, continuous_actions=True))
+
+
+def test_it_works_on_an_env_that_is_not_ours():
+    record = Record()
+    model = learn(flatten(spread_env(), n_copies=2, seed=0), [NeighborInclusiveReward(0.6), record], 20)
+    mixed_somewhere = False
+    for step, (rewards, infos, _) in enumerate(record.steps):
+        np.testing.assert_allclose(model.replay_buffer.rewards[step], expected_mix(infos, 3, 0.6), rtol=1e-5)
+        mixed_somewhere |= not np.allclose(rewards, [info["reward"] for info in infos])
+    assert mixed_somewhere
+    # SuperSuit marks no time limit; the flattening does.
+    assert model.replay_buffer.timeouts[7].all()
+
+
+def test_without_the_key_an_agent_keeps_its_reward():
+    callback = NeighborInclusiveReward(0.5, n_agents=2)
+    np.testing.assert_array_equal(callback.mix(np.array([1.0, 3.0]), [{}, {"neighbors": [0]}]), [1.0, 2.0])
+
+
+def test_the_mixed_return_is_logged_under_its_own_name(tmp_path):
+    env = VecMonitor(make_vec_env(CROWDED, n_flocks=1, seed=1))
+    model = DDPG("MlpPolicy", env, policy_kwargs={"features_extractor_class": FlockCNN}, buffer_size=500, device="cpu", seed=0)
+    model.set_logger(configure(str(tmp_path), ["csv"]))
+    model.learn(4 * 21, callback=[NeighborInclusiveReward(0.3), FlockMetrics()], log_interval=4)
+    model.logger.close()
+    header, *rows = (tmp_path / "progress.csv").read_text().splitlines()
+    logged = [dict(zip(header.split(","), row.split(","), strict=False)) for row in rows]
+    assert any(row["rollout/ep_mixed_rew_mean"] not in ("", row["rollout/ep_rew_mean"]) for row in logged)
+    assert any(row["flock/tracking_error"] for row in logged)
+    assert any(row["flock/connectivity"] for row in logged)
+
+
+def test_vec_normalize_is_refused():
+    env = VecNormalize(make_vec_env(CROWDED, n_flocks=1, seed=1), norm_reward=False)
+    with pytest.raises(SettingsError, match="VecNormalize is not accepted"):
+        learn(env, NeighborInclusiveReward(), 1, FlockCNN)
+
+
+def test_agents_that_cannot_be_counted_are_told():
+    env = make_vec_env(CROWDED, n_flocks=1, seed=1)
+    with pytest.raises(SettingsError, match="n_agents = 3.*divisor of 4"):
+        learn(env, NeighborInclusiveReward(n_agents=3), 1, FlockCNN)
+
+
+@pytest.mark.parametrize("lambda_", [-0.1, 1.1, float("nan")])
+def test_a_share_outside_0_1_is_refused(lambda_):
+    with pytest.raises(SettingsError, match="lambda_"):
+        NeighborInclusiveReward(lambda_)
+
+
+def test_noise_fades_linearly():
+    env = make_vec_env(CROWDED, n_flocks=1, seed=1)
+    model = learn(env, FadingNoise(0.4, 0.2), 10, FlockCNN, action_noise=NormalActionNoise(np.zeros(2), np.full(2, 9.0)))
+    # Ten vector steps; the last round starts with one tenth of the way left.
+    np.testing.assert_allclose(model.action_noise.noises[3]._sigma, 0.22)

@@ -1,0 +1,45 @@
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import DDPG
+
+from sb3_flock import FlockCNN, make_vec_env
+
+
+def space(side=11, channels=3):
+    return spaces.Box(0.0, 1.0, (channels, side, side), np.float32)
+
+
+@pytest.mark.parametrize(("side", "kwargs"), [(11, {}), (7, {"stride": 1}), (21, {"channels": (4, 8)}), (11, {"layer_norm": True})])
+def test_features_have_the_stated_shape(side, kwargs):
+    extractor = FlockCNN(space(side), features_dim=24, **kwargs)
+    assert extractor(th.rand(5, 3, side, side)).shape == (5, 24)
+    assert extractor.features_dim == 24
+
+
+def test_two_convolutions_and_one_dense_layer_each_behind_a_relu():
+    extractor = FlockCNN(space())
+    kinds = [type(module).__name__ for module in extractor.modules() if not list(module.children())]
+    assert kinds == ["Conv2d", "ReLU", "Conv2d", "ReLU", "Flatten", "Linear", "ReLU"]
+
+
+def test_every_anchor_matters():
+    extractor = FlockCNN(space())
+    observation = th.rand(1, 3, 11, 11, requires_grad=True)
+    extractor(observation).sum().backward()
+    assert (observation.grad != 0).all()
+
+
+def test_a_tensor_too_small_or_of_another_kind_is_told_clearly():
+    with pytest.raises(ValueError, match="do not fit a tensor of"):
+        FlockCNN(space(3))
+    with pytest.raises(ValueError, match="channels, l, l"):
+        FlockCNN(spaces.Box(0.0, 1.0, (5,), np.float32))
+
+
+def test_it_serves_in_plain_sb3():
+    env = make_vec_env(n_flocks=1, seed=0)
+    model = DDPG("MlpPolicy", env, policy_kwargs={"features_extractor_class": FlockCNN}, buffer_size=10, device="cpu")
+    assert isinstance(model.actor.features_extractor, FlockCNN)
+    assert model.predict(env.reset())[0].shape == (3, 2)
