@@ -66,7 +66,11 @@ def _user_errors() -> tuple[type[Exception], ...]:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(prog="sb3-flock", description="Vehicles that flock by reinforcement learning.")
+    parser = _Parser(
+        prog="sb3-flock",
+        description="Vehicles that flock by reinforcement learning.",
+        epilog="example: sb3-flock train --n-vehicles 5 --n-obstacles 2",
+    )
     parser.add_argument("--version", action=_Version, nargs=0, help="show the version and stop")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     _add_train(commands)
@@ -79,7 +83,6 @@ class _Parser(argparse.ArgumentParser):
     """argparse with errors in our one line, and no guessing of abbreviated flags."""
 
     def __init__(self, **kwargs: Any) -> None:
-        kwargs.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
         super().__init__(allow_abbrev=False, **kwargs)
 
     def error(self, message: str) -> Any:
@@ -162,7 +165,7 @@ def _train(options: argparse.Namespace, words: Sequence[str]) -> int:
 
     result = train(config, console, command=[shlex.join(["sb3-flock", *words])])
     policy = load_policy(result.best_model)
-    _evaluate_and_print(policy, config.scenario, episodes=1000, seed=0, console=console)
+    _evaluate_and_print(policy, config.scenario, config.test_episodes, seed=0, console=console)
     print(result.folder)
     return 0
 
@@ -210,7 +213,7 @@ def _evaluate(options: argparse.Namespace, words: Sequence[str]) -> int:
 
     if options.json is not None and not Path(options.json).absolute().parent.is_dir():
         raise SettingsError(f"--json {options.json}: there is no folder {Path(options.json).parent}")
-    policy = load_policy(options.policy, options.device)
+    policy = load_policy(options.policy, options.device)  # before the overrides: its scenario is what they change
     overrides = parse_overrides(options.set)
     overrides.update({key: value for key in ("n_vehicles", "n_obstacles") if (value := getattr(options, key)) is not None})
     scenario = load_config(Scenario, overrides=overrides, base=policy.scenario)
@@ -249,10 +252,9 @@ def _evaluate_and_print(policy: Any, scenario: Any, episodes: int, seed: int, co
         metrics = evaluate(policy, scenario, episodes, seed)
     for warning in caught:
         print(f"sb3-flock: warning: {warning.message}", file=sys.stderr)
-    title = (
-        f"{policy.path}: {scenario.n_vehicles} vehicles, {scenario.n_obstacles} obstacles, {episodes} episodes, seed {seed}"
-    )
-    RichConsole().print(metrics_table(metrics, scenario, title))
+    print(f"{policy.path}:")
+    print(f"{scenario.n_vehicles} vehicles, {scenario.n_obstacles} obstacles, {episodes} episodes, seed {seed}")
+    RichConsole().print(metrics_table(metrics, scenario))
     return metrics
 
 

@@ -50,10 +50,10 @@ PAPER: dict[tuple[int, int], dict[str, dict[str, float]]] = {
 _RATES = ("obstacle_violation_rate", "neighbor_violation_rate", "connectivity", "success_rate")
 
 
-def metrics_table(metrics: dict[str, Metric], scenario: Scenario, title: str) -> Table:
+def metrics_table(metrics: dict[str, Metric], scenario: Scenario) -> Table:
     """All metrics with their intervals, beside the paper's figures where it has some for as many vehicles and obstacles."""
     paper = PAPER.get((scenario.n_vehicles, scenario.n_obstacles), {})
-    table = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
     table.add_column("metric", no_wrap=True)
     for heading in ("mean", "95 % interval", "worst", *(f"paper {name.removeprefix('Table ')}" for name in paper)):
         table.add_column(heading, justify="right", no_wrap=True)

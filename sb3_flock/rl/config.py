@@ -72,6 +72,7 @@ class TrainingConfig(Settings):
 
     eval_freq: int = Field(20_000, ge=0, description="transitions between evaluations; 0: none")
     eval_episodes: int = Field(100, ge=1, description="episodes of an evaluation, the same ones every time")
+    test_episodes: int = Field(1000, ge=1, description="episodes of the table that `sb3-flock train` prints at the end")
     save_freq: int = Field(100_000, ge=0, description="transitions between checkpoints; 0: none")
     init_from: str | None = Field(None, description="policy (zip or run folder) whose weights to start from")
     output_dir: str = Field("runs", description="folder of the run folders")

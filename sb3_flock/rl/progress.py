@@ -10,6 +10,7 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
+from rich.text import Text
 from stable_baselines3.common.callbacks import BaseCallback
 
 
@@ -72,9 +73,11 @@ class FlockProgress(BaseCallback):
     def report_evaluation(self, line: str) -> None:
         """Show the outcome of an evaluation; a plain line where there is no terminal."""
         self.evaluation = line
-        if self._live is None:
-            steps, updates = self.speeds()
-            self.console.print(f"{line} | {steps:.0f} env steps/s, {updates:.0f} updates/s", soft_wrap=True)
+        if self._live is not None:
+            self._live.update(self._panel())
+            return
+        steps, updates = self.speeds()
+        self.console.print(f"{line} | {steps:.0f} env steps/s, {updates:.0f} updates/s", soft_wrap=True, highlight=False)
 
     def speeds(self) -> tuple[float, float]:
         """Transitions and updates per second over the last half minute or so."""
@@ -107,4 +110,4 @@ class FlockProgress(BaseCallback):
             f"too close {100 * too_close:.1f} %",
             f"obstacle {100 * obstacles:.1f} %",
         )
-        return Group(self._bar, grid, self.evaluation)
+        return Group(self._bar, grid, Text(self.evaluation))

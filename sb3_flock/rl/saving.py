@@ -61,10 +61,11 @@ class LoadedPolicy:
             raise PolicyError(
                 f"{self.path}: it sees {self.scenario.n_anchors} anchors a side, but the scenario has {scenario.n_anchors}"
             )
-        for name in ("link_range", "detection_range", "channel_radii", "anchor_width", "max_speed", "max_turn_rate"):
-            trained, flown = getattr(self.scenario, name), getattr(scenario, name)
-            if trained != flown:
-                warnings.warn(f"{self.path}: trained with {name} = {trained}, flown with {flown}", stacklevel=2)
+        names = ("link_range", "detection_range", "channel_radii", "anchor_width", "max_speed", "max_turn_rate")
+        values = [(name, getattr(self.scenario, name), getattr(scenario, name)) for name in names]
+        changed = [f"{name} = {trained}, flown with {flown}" for name, trained, flown in values if trained != flown]
+        if changed:
+            warnings.warn(f"{self.path}: trained with {'; '.join(changed)}", stacklevel=2)
 
     def predict(
         self, observation: np.ndarray, state: Any = None, episode_start: Any = None, deterministic: bool = True
@@ -102,6 +103,17 @@ def save_model(model: BaseAlgorithm, path: str | Path, config: TrainingConfig) -
     return path
 
 
+def check_device(device: str) -> None:
+    """Whether torch has a device.
+
+    :raises SettingsError: if not
+    """
+    try:
+        th.empty(0, device=None if device == "auto" else device)
+    except (RuntimeError, AssertionError) as error:  # torch built without CUDA asserts
+        raise SettingsError(f"device = {device!r}: {_first_line(error)}") from None
+
+
 def find_policy(path: str | Path) -> Path:
     """The zip that a path means: itself, or a run folder's best (else final) model.
 
@@ -124,8 +136,10 @@ def load_policy(path: str | Path, device: str = "cpu") -> LoadedPolicy:
     :param path: a zip or a run folder (its ``best_model.zip``)
     :param device: torch device
     :raises PolicyError: one line for a missing, damaged or foreign file
+    :raises SettingsError: for a device that torch does not have
     """
     path = find_policy(path)
+    check_device(device)
     try:
         with zipfile.ZipFile(path) as archive:
             member = json.loads(archive.read(MEMBER))

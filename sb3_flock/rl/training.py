@@ -24,8 +24,9 @@ from sb3_flock.rl.callbacks import FadingNoise, FlockMetrics, NeighborInclusiveR
 from sb3_flock.rl.config import TrainingConfig
 from sb3_flock.rl.config_io import to_yaml
 from sb3_flock.rl.progress import FlockProgress
-from sb3_flock.rl.saving import PolicyError, load_policy, save_model, versions
+from sb3_flock.rl.saving import PolicyError, check_device, load_policy, save_model, versions
 from sb3_flock.settings import SettingsError
+from sb3_flock.sim import World, episode_rng
 
 SELECTION_SEED = 1_000_000
 """Seed of the episodes on which the best model is chosen; no result is reported on them."""
@@ -58,17 +59,18 @@ def train(
     :param console: where progress goes; the default prints to stderr
     :param command: the command line, for ``command.txt``
     :param callbacks: further SB3 callbacks, called after ours
-    :raises SettingsError: for a device, a folder or a policy that cannot be used
+    :raises SettingsError: for a device or a folder that cannot be used
+    :raises PolicyError: for a policy to start from that cannot be used
+    :raises WorldError: if the arena is too crowded to start
     """
     console = console or Console(stderr=True)
     if config.torch_threads:
         th.set_num_threads(config.torch_threads)
     initial = None if config.init_from is None else load_policy(config.init_from)
-    try:
-        th.empty(0, device=None if config.device == "auto" else config.device)
-    except (RuntimeError, AssertionError) as error:
-        raise SettingsError(f"device = {config.device!r}: {str(error).splitlines()[0]}") from None
+    check_device(config.device)
     flown = config.flown_scenario()
+    for scenario in (config.scenario, flown):  # too crowded to start? Better told before the run folder is made
+        World(scenario).reset([episode_rng(config.seed, 0)])
     env = VecMonitor(make_vec_env(flown, config.n_flocks, config.num_cpus, seed=config.seed))
     folder = _new_run_folder(config)
     try:
@@ -84,6 +86,7 @@ def train(
             f"{config.algo} on {config.scenario.n_vehicles} vehicles, {config.scenario.n_obstacles} obstacles, "
             f"{config.n_flocks} flocks; device {model.device}, torch threads {th.get_num_threads()}; {folder}",
             soft_wrap=True,
+            highlight=False,
         )
         progress = FlockProgress(console, config.total_timesteps)
         parts: list[BaseCallback] = [
@@ -100,6 +103,7 @@ def train(
             model.learn(config.total_timesteps, CallbackList(parts), log_interval=config.n_flocks * flown.n_vehicles)
         finally:
             progress.stop()
+            model.logger.close()
             save_model(model, folder / "final_model.zip", config)
     finally:
         env.close()

@@ -13,7 +13,7 @@ VALUES = summarize({name: np.array([0.1, 0.2, np.nan]) for name in METRICS})
 
 def text(scenario, width=80):
     console = Console(width=width, record=True, file=io.StringIO())
-    console.print(metrics_table(VALUES, scenario, "title"))
+    console.print(metrics_table(VALUES, scenario))
     return console.export_text()
 
 

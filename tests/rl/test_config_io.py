@@ -1,0 +1,90 @@
+import pytest
+import yaml
+
+from sb3_flock.rl.config import TrainingConfig
+from sb3_flock.rl.config_io import load_config, parse_overrides, to_yaml
+from sb3_flock.settings import SettingsError, leaf_paths
+
+
+def write(tmp_path, text):
+    path = tmp_path / "config.yaml"
+    path.write_text(text)
+    return path
+
+
+def test_yaml_round_trips_and_every_key_has_its_comment(tmp_path):
+    config = load_config(TrainingConfig, overrides={"n_vehicles": 7, "net_arch": [32, 16], "training_scenario": {"arena": 0.5}})
+    text = to_yaml(config)
+    assert load_config(TrainingConfig, write(tmp_path, text)) == config
+    assert all(" # " in line for line in text.splitlines())
+    for path in leaf_paths(TrainingConfig):
+        assert f"{path[-1]}: " in text
+
+
+def test_keys_left_out_keep_their_defaults_and_overrides_win(tmp_path):
+    path = write(tmp_path, "scenario:\n  n_vehicles: 5\n  n_obstacles: 2\nseed: 9\n")
+    config = load_config(TrainingConfig, path, {"scenario.n_vehicles": 4, "lambda_": 0.5})
+    assert (config.scenario.n_vehicles, config.scenario.n_obstacles, config.seed) == (4, 2, 9)
+    assert config.scenario.reward.lambda_ == 0.5
+    assert config.learner == TrainingConfig().learner
+
+
+def test_an_empty_file_is_the_defaults(tmp_path):
+    assert load_config(TrainingConfig, write(tmp_path, "")) == TrainingConfig()
+
+
+def test_overrides_are_yaml_and_1e_3_is_a_number():
+    assert parse_overrides(["a=1e-3", "b=[1, 2]", "c=null", "d=text", "e={x: 1e-4}"]) == {
+        "a": 1e-3, "b": [1, 2], "c": None, "d": "text", "e": {"x": 1e-4},
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("scenario:\n  n_vehicels: 3\n", r"scenario.n_vehicels is not a parameter; did you mean n_vehicles\?"),
+        ("scenario: 3\n", "scenario = 3: a mapping"),
+        ("learner:\n  gamma: 1.5\n", "gamma = 1.5"),
+        ("[1, 2]", "a mapping of parameters"),
+        ("a: [", "not a YAML file"),
+        ("!!python/object/apply:os.system ['true']", "not a YAML file"),
+        ("algo: ppo\n", "algo = 'ppo'"),
+        ("learner:\n  gradient_steps: 0\n", "gradient_steps = 0"),
+        ("training_scenario:\n  arenas: 0.5\n", r"training_scenario: arenas .*did you mean arena\?"),
+        ("training_scenario:\n  n_anchors: 9\n", "training_scenario: n_anchors = 9"),
+        ("training_scenario:\n  reward: 3\n", "training_scenario: reward = 3"),
+    ],
+)
+def test_a_wrong_file_is_one_line(tmp_path, text, message):
+    with pytest.raises(SettingsError, match=message) as error:
+        load_config(TrainingConfig, write(tmp_path, text))
+    assert "\n" not in str(error.value)
+
+
+def test_a_missing_file_is_one_line(tmp_path):
+    with pytest.raises(SettingsError, match="No such file"):
+        load_config(TrainingConfig, tmp_path / "none.yaml")
+
+
+@pytest.mark.parametrize("assignment", ["gamma", "=3", "gamma=["])
+def test_a_wrong_override_is_one_line(assignment):
+    with pytest.raises(SettingsError, match="--set"):
+        parse_overrides([assignment])
+
+
+def test_training_overrides_change_the_flown_scenario_alone():
+    config = TrainingConfig(training_scenario={"n_obstacles": 4, "reward": {"obstacle_penalty": 7.0}})
+    flown = config.flown_scenario()
+    assert (flown.n_obstacles, config.scenario.n_obstacles) == (4, 1)
+    assert flown.reward.obstacle_penalty == 7.0
+    assert flown.reward.epsilon == config.scenario.reward.epsilon
+
+
+def test_the_papers_one_update_a_transition_is_expressible():
+    config = load_config(TrainingConfig, overrides={"gradient_steps": -1})
+    assert config.learner.gradient_steps == -1
+    assert "-1: one for each transition, the paper's Algorithm 1" in to_yaml(config)
+
+
+def test_yaml_is_plain():
+    assert yaml.safe_load(to_yaml(TrainingConfig()))["network"]["channels"] == [16, 32]
