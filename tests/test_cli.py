@@ -10,14 +10,27 @@ import yaml
 
 from sb3_flock.cli import main
 
-TINY = ["--set", "learning_starts=60", "--set", "eval_episodes=2", "--set", "buffer_size=500", "--set", "max_cycles=20", "--set", "test_episodes=3"]
+SETTINGS = ("learning_starts=60", "eval_episodes=2", "buffer_size=500", "max_cycles=20", "test_episodes=3")
+TINY = [word for setting in SETTINGS for word in ("--set", setting)]
 
 
 @pytest.fixture(scope="module")
 def run_folder(tmp_path_factory):
     """A run folder made by the command itself."""
     out = tmp_path_factory.mktemp("out")
-    words = ["train", "--n-vehicles", "2", "--n-obstacles", "1", "--total-timesteps", "200", "--n-flocks", "2", "--seed", "3"]
+    words = [
+        "train",
+        "--n-vehicles",
+        "2",
+        "--n-obstacles",
+        "1",
+        "--total-timesteps",
+        "200",
+        "--n-flocks",
+        "2",
+        "--seed",
+        "3",
+    ]
     assert main([*words, "--eval-freq", "100", "--output-dir", str(out), *TINY]) == 0
     return out / "ddpg_2v1o_1"
 

@@ -44,6 +44,7 @@ def policy_kwargs(network: NetworkConfig) -> dict[str, Any]:
 def build_model(config: TrainingConfig, env: VecEnv) -> OffPolicyAlgorithm:
     """The SB3 model of a config, untrained."""
     learner = config.learner
+    gradient_steps = max(1, round(learner.update_ratio * learner.train_freq * env.num_envs))
     algorithm, policy = ALGORITHMS[config.algo]
     return algorithm(
         policy,
@@ -55,7 +56,7 @@ def build_model(config: TrainingConfig, env: VecEnv) -> OffPolicyAlgorithm:
         tau=learner.tau,
         gamma=learner.gamma,
         train_freq=learner.train_freq,
-        gradient_steps=learner.gradient_steps,
+        gradient_steps=gradient_steps,
         n_steps=learner.n_steps,
         action_noise=_noise(config),
         policy_kwargs=policy_kwargs(config.network),

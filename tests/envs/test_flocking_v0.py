@@ -84,7 +84,10 @@ def test_registered_with_pettingzoo_and_kwargs_reach_the_scenario():
 
 
 def test_spaces_do_not_depend_on_the_number_of_bodies():
-    small, large = flocking_v0.parallel_env(n_vehicles=1, n_obstacles=0), flocking_v0.parallel_env(n_vehicles=9, n_obstacles=7)
+    small, large = (
+        flocking_v0.parallel_env(n_vehicles=1, n_obstacles=0),
+        flocking_v0.parallel_env(n_vehicles=9, n_obstacles=7),
+    )
     assert small.observation_space("vehicle_0") == large.observation_space("vehicle_8")
     assert small.action_space("vehicle_0") == large.action_space("vehicle_8")
     action_space = small.action_space("vehicle_0")

@@ -83,7 +83,6 @@ def test_it_works_with_n_step_returns():
     np.testing.assert_allclose(model.replay_buffer.rewards[2], expected_mix(record.steps[2][1], 4, 0.5), rtol=1e-5)
 
 
-
 def spread_env():
     from pettingzoo.utils import BaseParallelWrapper
 
@@ -120,7 +119,9 @@ def test_without_the_key_an_agent_keeps_its_reward():
 
 def test_the_mixed_return_is_logged_under_its_own_name(tmp_path):
     env = VecMonitor(make_vec_env(CROWDED, n_flocks=1, seed=1))
-    model = DDPG("MlpPolicy", env, policy_kwargs={"features_extractor_class": FlockCNN}, buffer_size=500, device="cpu", seed=0)
+    model = DDPG(
+        "MlpPolicy", env, policy_kwargs={"features_extractor_class": FlockCNN}, buffer_size=500, device="cpu", seed=0
+    )
     model.set_logger(configure(str(tmp_path), ["csv"]))
     model.learn(4 * 21, callback=[NeighborInclusiveReward(0.3), FlockMetrics()], log_interval=4)
     model.logger.close()

@@ -13,7 +13,7 @@ def write(tmp_path, text):
 
 
 def test_yaml_round_trips_and_every_key_has_its_comment(tmp_path):
-    config = load_config(TrainingConfig, overrides={"n_vehicles": 7, "net_arch": [32, 16], "training_scenario": {"arena": 0.5}})
+    config = load_config(TrainingConfig, overrides={"n_vehicles": 7, "net_arch": [32, 16]})
     text = to_yaml(config)
     assert load_config(TrainingConfig, write(tmp_path, text)) == config
     assert all(" # " in line for line in text.splitlines())
@@ -49,10 +49,7 @@ def test_overrides_are_yaml_and_1e_3_is_a_number():
         ("a: [", "not a YAML file"),
         ("!!python/object/apply:os.system ['true']", "not a YAML file"),
         ("algo: ppo\n", "algo = 'ppo'"),
-        ("learner:\n  gradient_steps: 0\n", "gradient_steps = 0"),
-        ("training_scenario:\n  arenas: 0.5\n", r"training_scenario: arenas .*did you mean arena\?"),
-        ("training_scenario:\n  n_anchors: 9\n", "training_scenario: n_anchors = 9"),
-        ("training_scenario:\n  reward: 3\n", "training_scenario: reward = 3"),
+        ("practice:\n  separation_ratio: 0.5\n", "separation_ratio = 0.5"),
     ],
 )
 def test_a_wrong_file_is_one_line(tmp_path, text, message):
@@ -72,18 +69,14 @@ def test_a_wrong_override_is_one_line(assignment):
         parse_overrides([assignment])
 
 
-def test_training_overrides_change_the_flown_scenario_alone():
-    config = TrainingConfig(training_scenario={"n_obstacles": 4, "reward": {"obstacle_penalty": 7.0}})
+def test_practice_is_harder_than_the_task_and_scales_with_it():
+    overrides = {"n_obstacles": 1, "obstacle_arena": 40.0, "neighbor_separation": 2.0, "link_range": 2.04}
+    config = load_config(TrainingConfig, overrides={**overrides, "extra_obstacles": 3, "separation_ratio": 1.1})
     flown = config.flown_scenario()
-    assert (flown.n_obstacles, config.scenario.n_obstacles) == (4, 1)
-    assert flown.reward.obstacle_penalty == 7.0
-    assert flown.reward.epsilon == config.scenario.reward.epsilon
-
-
-def test_the_papers_one_update_a_transition_is_expressible():
-    config = load_config(TrainingConfig, overrides={"gradient_steps": -1})
-    assert config.learner.gradient_steps == -1
-    assert "-1: one for each transition, the paper's Algorithm 1" in to_yaml(config)
+    assert (flown.n_obstacles, flown.obstacle_arena, flown.neighbor_separation) == (4, 20.0, 2.04)
+    assert config.scenario.n_obstacles == 1
+    none = load_config(TrainingConfig, overrides={"n_obstacles": 0, "extra_obstacles": 3})
+    assert none.flown_scenario().n_obstacles == 0
 
 
 def test_yaml_is_plain():

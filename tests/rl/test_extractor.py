@@ -11,7 +11,9 @@ def space(side=11, channels=3):
     return spaces.Box(0.0, 1.0, (channels, side, side), np.float32)
 
 
-@pytest.mark.parametrize(("side", "kwargs"), [(11, {}), (7, {"stride": 1}), (21, {"channels": (4, 8)}), (11, {"layer_norm": True})])
+@pytest.mark.parametrize(
+    ("side", "kwargs"), [(11, {}), (7, {"stride": 1}), (21, {"channels": (4, 8)}), (11, {"layer_norm": True})]
+)
 def test_features_have_the_stated_shape(side, kwargs):
     extractor = FlockCNN(space(side), features_dim=24, **kwargs)
     assert extractor(th.rand(5, 3, side, side)).shape == (5, 24)

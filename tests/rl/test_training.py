@@ -18,7 +18,7 @@ from sb3_flock.settings import SettingsError
 
 TINY = {
     "total_timesteps": 300, "n_flocks": 2, "eval_freq": 120, "eval_episodes": 2, "save_freq": 150, "max_cycles": 20,
-    "learning_starts": 60, "buffer_size": 1000, "batch_size": 16, "gradient_steps": 2, "features_dim": 16, "net_arch": [16],
+    "learning_starts": 60, "buffer_size": 1000, "batch_size": 16, "update_ratio": 0.34, "features_dim": 16, "net_arch": [16],
 }  # fmt: skip
 
 
@@ -55,6 +55,12 @@ def _untrained(config):
 
     model = build_model(config, make_vec_env(config.flown_scenario(), config.n_flocks, seed=0))
     return {name: value.clone() for name, value in model.policy.state_dict().items()}
+
+
+def test_the_papers_one_update_a_transition(tmp_path):
+    model = train(tiny(tmp_path, update_ratio=1, train_freq=2, eval_freq=0), quiet()).model
+    assert model.gradient_steps == 2 * 6
+    assert model._n_updates == 300 - 60
 
 
 def test_the_run_folder_holds_what_is_promised(tmp_path):

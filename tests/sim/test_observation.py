@@ -114,7 +114,11 @@ def test_nothing_outside_its_sensing_range_shows(seed):
         rest = [j for j in range(4) if j == i or sensing.neighbors[0, i, j]]
         seen = sensing.detections[0, i]
         near = place(
-            SCENARIO, world.positions[0, rest], world.headings[0, rest], world.obstacle_positions[0, seen], world.waypoints[0]
+            SCENARIO,
+            world.positions[0, rest],
+            world.headings[0, rest],
+            world.obstacle_positions[0, seen],
+            world.waypoints[0],
         )
         alone = observe(sense(near), near.scenario)[0, rest.index(i)]
         np.testing.assert_allclose(alone, observe(sensing, SCENARIO)[0, i], atol=1e-6)

@@ -6,7 +6,14 @@ from hypothesis import strategies as st
 from sb3_flock.sim import Scenario, mix_rewards, own_reward, reward_terms, sense
 from tests.sim.conftest import place
 
-WEIGHTS = {"epsilon": 0.5, "beta": -0.01, "link_bonus": 1.0, "separation_penalty": 1.0, "obstacle_penalty": 1.0, "scale": 1.0}
+WEIGHTS = {
+    "epsilon": 0.5,
+    "beta": -0.01,
+    "link_bonus": 1.0,
+    "separation_penalty": 1.0,
+    "obstacle_penalty": 1.0,
+    "scale": 1.0,
+}
 PAPER = Scenario(reward=WEIGHTS)
 
 
@@ -33,7 +40,9 @@ def test_thresholds_are_strict():
 
 
 def test_weights_and_scale_multiply_their_terms():
-    scenario = PAPER.replace(reward=PAPER.reward.replace(separation_penalty=3.0, obstacle_penalty=2.0, link_bonus=0.5, scale=0.1))
+    scenario = PAPER.replace(
+        reward=PAPER.reward.replace(separation_penalty=3.0, obstacle_penalty=2.0, link_bonus=0.5, scale=0.1)
+    )
     world = place(scenario, [(0.0, 0.0), (0.12, 0.0), (-0.05, 0.0)], [0.0] * 3, obstacles=[(0.0, 0.1)], waypoint=(1.0, 0.0))
     terms = reward_terms(sense(world), np.zeros((1, 3, 2)), world.scenario)
     np.testing.assert_allclose(terms["connectivity"][0, 0], 0.1 * (0.5 - 3.0))

@@ -6,7 +6,12 @@ from sb3_flock.sim import RewardWeights, Scenario
 
 def test_the_defaults_are_the_papers_numbers():
     scenario = Scenario()
-    assert (scenario.time_step, scenario.max_speed, scenario.obstacle_max_speed, scenario.waypoint_speed) == (0.1, 0.15, 0.1, 0.1)
+    assert (scenario.time_step, scenario.max_speed, scenario.obstacle_max_speed, scenario.waypoint_speed) == (
+        0.1,
+        0.15,
+        0.1,
+        0.1,
+    )
     assert (scenario.link_range, scenario.neighbor_separation) == (0.15, 0.1)
     assert (scenario.detection_range, scenario.obstacle_separation) == (0.25, 0.15)
     assert (scenario.arena, scenario.n_anchors) == (1.0, 11)

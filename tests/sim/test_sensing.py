@@ -34,7 +34,13 @@ def test_one_vehicle_and_no_obstacle_leave_empty_graphs(scenario, place):
 
 @pytest.mark.parametrize(
     ("links", "n", "connected"),
-    [([], 1, True), ([], 2, False), ([(0, 1)], 2, True), ([(0, 1), (2, 3)], 4, False), ([(i, i + 1) for i in range(8)], 9, True)],
+    [
+        ([], 1, True),
+        ([], 2, False),
+        ([(0, 1)], 2, True),
+        ([(0, 1), (2, 3)], 4, False),
+        ([(i, i + 1) for i in range(8)], 9, True),
+    ],
 )
 def test_connectivity_of_chains_and_islands(links, n, connected):
     graph = np.zeros((2, n, n), dtype=bool)

@@ -1,0 +1,31 @@
+"""The neighbor-inclusive reward on somebody else's env: MPE2's simple_spread (pip install mpe2).
+
+All the callback needs is ``info["neighbors"]``: the indices into ``possible_agents`` of each agent's neighbors.
+"""
+
+import sys
+
+import numpy as np
+from mpe2 import simple_spread_v3
+from pettingzoo.utils import BaseParallelWrapper
+from stable_baselines3 import DDPG
+
+from sb3_flock import NeighborInclusiveReward, flatten
+
+
+class NeighborsWithinOne(BaseParallelWrapper):
+    """Everyone within distance 1 of an agent is its neighbor."""
+
+    def step(self, actions):
+        observations, rewards, terminations, truncations, infos = super().step(actions)
+        positions = np.array([observations[agent][2:4] for agent in observations])
+        for agent, position in zip(observations, positions, strict=True):
+            distances = np.linalg.norm(positions - position, axis=-1)
+            infos[agent]["neighbors"] = np.flatnonzero((distances > 0) & (distances < 1))
+        return observations, rewards, terminations, truncations, infos
+
+
+env = NeighborsWithinOne(simple_spread_v3.parallel_env(N=3, local_ratio=1.0, continuous_actions=True))
+model = DDPG("MlpPolicy", flatten(env, n_copies=4, seed=0), learning_starts=500, buffer_size=50_000, gradient_steps=2)
+model.learn(int(sys.argv[1]) if len(sys.argv) > 1 else 20_000, callback=NeighborInclusiveReward(lambda_=0.5))
+print(f"{model.num_timesteps} transitions, mean stored reward {model.replay_buffer.rewards[:100].mean():.3f}")

@@ -1,0 +1,38 @@
+"""Every example runs, shortened by its own argument."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+from sb3_flock.cli import main
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+
+
+def run(name, *arguments, cwd):
+    return subprocess.run(
+        [sys.executable, EXAMPLES / name, *map(str, arguments)], cwd=cwd, capture_output=True, text=True, check=True
+    ).stdout
+
+
+def test_the_sb3_script_is_short_trains_and_saves(tmp_path):
+    assert "mean=" in run("train_with_sb3.py", 2400, cwd=tmp_path)
+    assert (tmp_path / "flock_ddpg.zip").exists()
+    code = (EXAMPLES / "train_with_sb3.py").read_text().splitlines()
+    assert len([line for line in code if line.strip() and not line.startswith('"""')]) < 25
+
+
+def test_another_env(tmp_path):
+    assert "2004 transitions" in run("neighbors_of_another_env.py", 2000, cwd=tmp_path)
+
+
+def test_evaluating_a_policy(tmp_path):
+    words = ["train", "--total-timesteps", "60", "--eval-freq", "0", "--output-dir", str(tmp_path)]
+    assert main([*words, "--set", "test_episodes=1", "--set", "buffer_size=100"]) == 0
+    assert run("evaluate_policy.py", tmp_path / "ddpg_3v1o_1", cwd=tmp_path).count("vehicles:") == 4
+
+
+def test_no_example_is_left_out():
+    source = Path(__file__).read_text()
+    for path in EXAMPLES.glob("*.py"):
+        assert path.name in source
