@@ -12,7 +12,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_flock.rl.config import NetworkConfig, TrainingConfig
+from sb3_flock.rl.config import TrainingConfig
 from sb3_flock.rl.policy import FlockPolicy, FlockSACPolicy
 
 ALGORITHMS: dict[str, tuple[type[OffPolicyAlgorithm], type[BasePolicy]]] = {
@@ -23,9 +23,12 @@ ALGORITHMS: dict[str, tuple[type[OffPolicyAlgorithm], type[BasePolicy]]] = {
 """SB3's algorithm and our policy class by the name of ``TrainingConfig.algo``."""
 
 
-def policy_kwargs(network: NetworkConfig) -> dict[str, Any]:
-    """The ``policy_kwargs`` that build these networks in any of :data:`ALGORITHMS`."""
+def policy_kwargs(config: TrainingConfig) -> dict[str, Any]:
+    """The ``policy_kwargs`` that build a config's networks."""
+    network = config.network
+    bound = {} if config.algo == "sac" else {"action_bound": network.action_bound}
     return {
+        **bound,
         "net_arch": list(network.net_arch),
         "n_critics": network.n_critics,
         "action_layer": network.action_layer,
@@ -59,7 +62,7 @@ def build_model(config: TrainingConfig, env: VecEnv) -> OffPolicyAlgorithm:
         gradient_steps=gradient_steps,
         n_steps=learner.n_steps,
         action_noise=_noise(config),
-        policy_kwargs=policy_kwargs(config.network),
+        policy_kwargs=policy_kwargs(config),
         seed=config.seed,
         device=config.device,
     )

@@ -23,6 +23,10 @@ class NetworkConfig(Settings):
     final_init: float | None = Field(
         3e-3, gt=0, description="bound of the output layers' uniform start; null: torch's own (open)"
     )
+    action_bound: Literal["inverting", "tanh"] = Field(
+        "inverting",
+        description="how the actor's output is bounded, but for sac: a clamp with inverting gradients or tanh (open)",
+    )
     n_critics: int = Field(2, ge=1, description="critic networks, the smallest value counts (ours; paper: 1)")
 
 

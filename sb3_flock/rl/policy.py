@@ -55,6 +55,33 @@ class ActionLayerCritic(ContinuousCritic):
         return self.q_networks[index](th.cat([features, self.action_layers[index](actions)], dim=1))
 
 
+class _InvertingClamp(th.autograd.Function):
+    """Clamps to [-1, 1]; the gradient shrinks as it pushes towards a bound and turns around beyond it."""
+
+    @staticmethod
+    def forward(ctx: Any, raw: th.Tensor) -> th.Tensor:
+        ctx.save_for_backward(raw)
+        return raw.clamp(-1.0, 1.0)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: th.Tensor) -> th.Tensor:
+        (raw,) = ctx.saved_tensors
+        room = th.where(gradient < 0, 1.0 - raw, 1.0 + raw)  # descent along a negative gradient raises the output
+        return gradient * room / 2
+
+
+class InvertingBound(nn.Module):
+    """The actor's action bound: a clamp to [-1, 1] with inverting gradients (Hausknecht and Stone, 2016).
+
+    A tanh saturates here: standing still is a bound of the speed, its input runs off to -10 and beyond, and no gradient ever
+    calls it back. A clamp with inverting gradients reaches the bound exactly and leaves it as soon as the critic prefers to.
+    """
+
+    def forward(self, raw: th.Tensor) -> th.Tensor:
+        """Bounded actions, the shape as it was."""
+        return _InvertingClamp.apply(raw)
+
+
 def init_output_layer(network: nn.Module, bound: float | None) -> None:
     """Start the last linear layer of a network uniform in ``[-bound, bound]``, so that a tanh behind it is not saturated."""
     if bound is None:
@@ -101,15 +128,29 @@ class _FlockPolicyMixin(BasePolicy):
 class FlockPolicy(_FlockPolicyMixin, TD3Policy):
     """The paper's networks for DDPG and TD3 (section IV-C, Fig. 2).
 
-    Actor: :class:`FlockCNN`, ``net_arch`` (the last hidden layer), tanh, action bound and bias (SB3 scales tanh's output to
-    the action space). Critic: a :class:`FlockCNN` of its own, an action layer, joined, ``net_arch``, one value.
+    Actor: :class:`FlockCNN`, ``net_arch`` (the last hidden layer), action bound and bias (SB3 scales [-1, 1] to the action
+    space). Critic: a :class:`FlockCNN` of its own, an action layer, joined, ``net_arch``, one value.
 
     :param action_layer: width of the critic's hidden layer for the action
     :param final_init: bound of the uniform start of the output layers; ``None`` keeps torch's
     :param net_arch: widths behind the extractor; the default ``[64]`` is the state path's fourth hidden layer
+    :param action_bound: ``"inverting"`` (:class:`InvertingBound`) or ``"tanh"``
 
     The other parameters are those of SB3's ``TD3Policy``.
     """
+
+    def __init__(self, *args: Any, action_bound: str = "inverting", **kwargs: Any) -> None:
+        self.action_bound = action_bound
+        super().__init__(*args, **kwargs)
+
+    def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Any:
+        actor = super().make_actor(features_extractor)
+        if self.action_bound == "inverting":
+            actor.mu[-1] = InvertingBound()
+        return actor
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return {**super()._get_constructor_parameters(), "action_bound": self.action_bound}
 
 
 class FlockSACPolicy(_FlockPolicyMixin, SACPolicy):

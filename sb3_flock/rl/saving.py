@@ -170,7 +170,7 @@ def _build_policy(config: TrainingConfig) -> BasePolicy:
         observation_space(config.scenario),
         action_space(config.scenario),
         lr_schedule=lambda _: 0.0,
-        **policy_kwargs(config.network),
+        **policy_kwargs(config),
     )
 
 

@@ -5,6 +5,7 @@ from torch import nn
 
 from sb3_flock import FlockCNN, FlockPolicy, FlockSACPolicy
 from sb3_flock.envs.flocking_v0 import action_space, observation_space
+from sb3_flock.rl.policy import InvertingBound
 from sb3_flock.sim import Scenario
 
 SCENARIO = Scenario()
@@ -72,6 +73,29 @@ def test_actions_end_in_the_papers_bound_and_bias():
     assert actions.min(0)[0] >= 0
     assert actions.max(0)[0] <= np.float32(0.15)
     assert np.abs(actions[:, 1]).max() <= np.float32(np.pi)
+
+
+def test_the_bound_clamps_and_its_gradient_shrinks_towards_it_and_turns_around_beyond():
+    raw = th.tensor([-3.0, -1.0, 0.0, 0.5, 1.0, 3.0], requires_grad=True)
+    bounded = InvertingBound()(raw)
+    assert bounded.tolist() == [-1.0, -1.0, 0.0, 0.5, 1.0, 1.0]
+    (raising,) = th.autograd.grad(-bounded.sum(), raw, retain_graph=True)  # descent would raise every output
+    assert raising.tolist() == [-2.0, -1.0, -0.5, -0.25, 0.0, 1.0]
+    (lowering,) = th.autograd.grad(bounded.sum(), raw)
+    assert lowering.tolist() == [-1.0, 0.0, 0.5, 0.75, 1.0, 2.0]
+
+
+@pytest.mark.parametrize(("action_bound", "leaves"), [("inverting", True), ("tanh", False)])
+def test_an_actor_stuck_beyond_its_bound_comes_back_unless_it_is_a_tanh(action_bound, leaves):
+    actor = build(action_bound=action_bound).actor
+    th.nn.init.constant_(actor.mu[-2].bias, -20.0)
+    optimizer = th.optim.SGD([actor.mu[-2].bias], lr=1.0)
+    for _ in range(60):
+        loss = (actor(OBSERVATIONS) - 0.5).square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    assert (actor(OBSERVATIONS).mean().item() == pytest.approx(0.5, abs=0.1)) == leaves
 
 
 @pytest.mark.parametrize("policy_class", [FlockPolicy, FlockSACPolicy])
