@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sb3_flock.settings import SettingsError
+from sb3_flock.settings import SettingsError, UserError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -38,7 +38,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command.
 
     :param arguments: the words after ``sb3-flock``; the default is the process's own
-    :return: the exit code: 0, 2 after a user's mistake (told in one line on stderr), 130 after Ctrl-C
+    :return: the exit code: 0, 2 after a user's mistake (told in one line on stderr), 130 after Ctrl-C, 1 if nobody reads
+        the output
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     parser = _parser()
@@ -51,18 +52,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("sb3-flock: interrupted", file=sys.stderr)
         return INTERRUPTED
-    except _user_errors() as error:
+    except UserError as error:
         print(f"sb3-flock: {error}", file=sys.stderr)
         return USAGE_ERROR
-
-
-def _user_errors() -> tuple[type[Exception], ...]:
-    """What a user's mistake raises; looked up late, for the modules are slow to import."""
-    errors: list[type[Exception]] = [SettingsError]
-    for module, name in (("sb3_flock.rl.saving", "PolicyError"), ("sb3_flock.sim.world", "WorldError")):
-        if module in sys.modules:
-            errors.append(getattr(sys.modules[module], name))
-    return tuple(errors)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -123,26 +115,22 @@ def _add_train(commands: Any) -> None:
 
 def _add_config_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--config", metavar="FILE", help="YAML file of parameters; flags below win over it")
-    descriptions = {
-        "scenario.n_vehicles": "number of vehicles",
-        "scenario.n_obstacles": "number of obstacles",
-    }
     for flag, (path, metavar) in _TRAIN_FLAGS.items():
-        parser.add_argument(flag, dest=path, metavar=metavar, help=descriptions.get(path) or _LazyHelp(path))
+        parser.add_argument(flag, dest=path, metavar=metavar, help=_field_help(path))
     _add_set(parser, "reward.lambda_=0.5")
 
 
-class _LazyHelp(str):
-    """A config field's own description and default, looked up when the help is printed (the config's import is slow)."""
+def _field_help(path: str) -> str:
+    """A config field's own description and default."""
+    from sb3_flock.rl.config import TrainingConfig
 
-    __slots__ = ()
-
-    def __mod__(self, _: Any) -> str:
-        from sb3_flock.rl.config import TrainingConfig
-
-        field = TrainingConfig.model_fields[str(self)]
-        default = "" if field.default is None else f" [{field.default}]"
-        return f"{field.description}{default}"
+    *groups, name = path.split(".")
+    settings: Any = TrainingConfig
+    for group in groups:
+        settings = settings.model_fields[group].annotation
+    field = settings.model_fields[name]
+    default = "" if field.default is None else f" [{field.default}]"
+    return f"{field.description}{default}".replace("%", "%%")
 
 
 def _config_of(options: argparse.Namespace) -> Any:
@@ -154,8 +142,6 @@ def _config_of(options: argparse.Namespace) -> Any:
 
 
 def _train(options: argparse.Namespace, words: Sequence[str]) -> int:
-    import shlex
-
     from rich.console import Console
 
     config = _config_of(options)
@@ -163,7 +149,7 @@ def _train(options: argparse.Namespace, words: Sequence[str]) -> int:
     from sb3_flock.rl.saving import load_policy
     from sb3_flock.rl.training import train
 
-    result = train(config, console, command=[shlex.join(["sb3-flock", *words])])
+    result = train(config, console, command=["sb3-flock", *words])
     policy = load_policy(result.best_model)
     _evaluate_and_print(policy, config.scenario, config.test_episodes, seed=0, console=console)
     print(result.folder)
@@ -213,7 +199,7 @@ def _evaluate(options: argparse.Namespace, words: Sequence[str]) -> int:
 
     if options.json is not None and not Path(options.json).absolute().parent.is_dir():
         raise SettingsError(f"--json {options.json}: there is no folder {Path(options.json).parent}")
-    policy = load_policy(options.policy, options.device)  # before the overrides: its scenario is what they change
+    policy = load_policy(options.policy, options.device)
     overrides = parse_overrides(options.set)
     overrides.update({key: value for key in ("n_vehicles", "n_obstacles") if (value := getattr(options, key)) is not None})
     scenario = load_config(Scenario, overrides=overrides, base=policy.scenario)

@@ -15,8 +15,12 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 _Settings = TypeVar("_Settings", bound="Settings")
 
 
-class SettingsError(ValueError):
-    """A parameter has a value that is not accepted; the message is one line for the user."""
+class UserError(ValueError):
+    """Something that the user can mend; the message is one line that says what."""
+
+
+class SettingsError(UserError):
+    """A parameter has a value that is not accepted."""
 
 
 class Settings(BaseModel):
@@ -25,7 +29,7 @@ class Settings(BaseModel):
     :raises SettingsError: one line per wrong parameter, naming it, its value and what is accepted
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=False)
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     def __init__(self, **values: Any) -> None:
         try:

@@ -1,13 +1,13 @@
 """Flocking: vehicles follow a moving waypoint together, keep apart, avoid obstacles and stay in touch.
 
 ========================  ==========================================================================================
-Import                    ``from sb3_flock import flocking_v0`` or ``pettingzoo.make("parallel", "flock/flocking-v0")``
+Import                    ``from sb3_flock import flocking_v0``; then ``pettingzoo.make("parallel", "flock/flocking-v0")``, too
 Agents                    ``vehicle_0`` ... ``vehicle_{n-1}``; all live through the whole episode
 Actions                   continuous, ``Box([0, -pi], [0.15, pi], (2,))``: speed v [m/s] and turn rate omega [rad/s]
 Observations              ``Box(0, 1e6, (3, 11, 11), float32)``: neighbors, obstacles, waypoint in the body frame
-Rewards                   r_i of section IV-B, without the neighbors' share (:func:`sb3_flock.sim.mix_rewards` mixes)
+Rewards                   r_i of section IV-B with our weights, without the neighbors' share, which training mixes in
 Termination, truncation   never terminated; all agents are truncated after ``max_cycles`` steps
-Rendering                 ``human`` (a window; needs pygame) and ``rgb_array``
+Rendering                 ``human`` (a window) and ``rgb_array``; both need pygame, the ``render`` extra
 ========================  ==========================================================================================
 
 **Observation.** ``obs[c, a, b]``: channel c (0 neighbors, 1 obstacles, 2 waypoint) at anchor a along the body's forward
@@ -148,7 +148,7 @@ class parallel_env(ParallelEnv[str, Observation, Action]):  # noqa: N801 - Petti
     def render(self) -> NDArray[np.uint8] | None:
         """Draw the flock: an ``(height, width, 3)`` picture in ``rgb_array`` mode, a window in ``human`` mode.
 
-        :raises ImportError: in ``human`` mode without pygame
+        :raises ImportError: without pygame
         """
         if self.render_mode is None:
             return None

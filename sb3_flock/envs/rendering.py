@@ -50,7 +50,7 @@ class Renderer:
         self.canvas = pygame.Surface((_SIZE, _SIZE))
         self._window: pygame.Surface | None = None
         self._clock = pygame.time.Clock()
-        half = _MARGIN * max(scenario.arena, scenario.obstacle_arena)
+        half = _MARGIN * max(scenario.arena, scenario.obstacle_half_side)
         self._scale = _SIZE / (2 * half)
 
     def draw(self, world: World) -> NDArray[np.uint8] | None:

@@ -7,7 +7,8 @@ Every agent of every copy becomes one slot of the vector env, copy by copy: slot
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -40,6 +41,7 @@ def make_vec_env(
     :param render_mode: as in :class:`~sb3_flock.envs.flocking_v0.parallel_env`; the first flock is drawn
     :raises SettingsError: for a count that is not accepted
     """
+    _check_integer("n_flocks", n_flocks, least=1)
     return flatten(flocking_v0.parallel_env(scenario, render_mode=render_mode), n_flocks, num_cpus, seed)
 
 
@@ -52,14 +54,18 @@ def flatten(env: ParallelEnv, n_copies: int = 1, num_cpus: int = 0, seed: int | 
     :param seed: seeds all copies, each with a stream of its own
     :raises SettingsError: for a count that is not accepted
     """
-    for name, value, least in (("n_copies", n_copies, 1), ("num_cpus", num_cpus, 0)):
-        if not isinstance(value, (int, np.integer)) or value < least:
-            raise SettingsError(f"{name} = {value!r}: input should be an integer of at least {least}")
+    _check_integer("n_copies", n_copies, least=1)
+    _check_integer("num_cpus", num_cpus, least=0)
     flat = supersuit.pettingzoo_env_to_vec_env_v1(env)
     vec_env = supersuit.concat_vec_envs_v1(flat, n_copies, num_cpus=num_cpus, base_class="gymnasium")
     adapter = ParameterSharingVecEnv(vec_env, env)
     adapter.seed(seed)
     return adapter
+
+
+def _check_integer(name: str, value: int, least: int) -> None:
+    if not isinstance(value, (int, np.integer)) or value < least:
+        raise SettingsError(f"{name} = {value!r}: input should be an integer of at least {least}")
 
 
 class ParameterSharingVecEnv(SB3VecEnvWrapper):
@@ -82,12 +88,18 @@ class ParameterSharingVecEnv(SB3VecEnvWrapper):
         self._has_workers = isinstance(venv, ProcConcatVec)
         self._seed: int | None = None
         self._unseeded = True
+        self._options: dict[str, Any] | None = None
         self._closed = False
 
     # -- seeding -----------------------------------------------------------------------------------------------------
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Store a seed for the next reset, as SB3's own vector envs do; ``None`` means fresh entropy at the first one."""
+        """Store a seed for the next reset, as SB3's own vector envs do; ``None`` means fresh entropy at the first one.
+
+        :raises SettingsError: for a negative seed
+        """
+        if seed is not None:
+            _check_integer("seed", seed, least=0)
         self._seed = seed
         return [seed] * self.num_envs
 
@@ -104,8 +116,10 @@ class ParameterSharingVecEnv(SB3VecEnvWrapper):
             # SuperSuit hands copy i the seed `first + i`; hashing keeps the copies of neighboring seeds apart.
             first = int(np.random.SeedSequence(self._seed).generate_state(1)[0]) // 2
         self._seed, self._unseeded = None, False
+        options, self._options = (self._options if options is None else options), None
         if self._has_workers:
-            observations, infos = self._reset_workers(first, options)
+            with self._guarded():
+                observations, infos = self._reset_workers(first, options)
         else:
             observations, infos = self.venv.reset(seed=first, options=options)
         self.reset_infos = infos
@@ -125,27 +139,29 @@ class ParameterSharingVecEnv(SB3VecEnvWrapper):
 
     def step_async(self, actions: NDArray[Any]) -> None:
         """Send one action to each slot."""
-        try:
+        with self._guarded():
             self.venv.step_async(actions)
-        except (EOFError, OSError) as error:
-            raise self._worker_died() from error
 
     def step_wait(self) -> VecEnvStepReturn:
         """Collect the step: ``(observations, rewards, dones, infos)`` as SB3 expects them."""
-        try:
+        with self._guarded():
             observations, rewards, terminations, truncations, infos = self.venv.step_wait()
-        except (EOFError, OSError) as error:
-            raise self._worker_died() from error
         terminations, truncations = np.asarray(terminations, dtype=bool), np.asarray(truncations, dtype=bool)
         dones = terminations | truncations
         for slot in np.flatnonzero(dones):
             infos[slot] = {**infos[slot], "TimeLimit.truncated": bool(truncations[slot] and not terminations[slot])}
         return observations, rewards, dones, infos
 
-    def _worker_died(self) -> RuntimeError:
-        dead = [f"{proc.pid} (exit code {proc.exitcode})" for proc in self.venv.procs if not proc.is_alive()]
-        self.close()
-        return RuntimeError(f"an environment worker died: process {', '.join(dead) or 'unknown'}; the rest was closed")
+    @contextmanager
+    def _guarded(self) -> Iterator[None]:
+        """Turn the broken pipe of a dead worker into one clear error and close the rest."""
+        try:
+            yield
+        except (EOFError, OSError) as error:
+            dead = [f"{proc.pid} (exit code {proc.exitcode})" for proc in self.venv.procs if not proc.is_alive()]
+            self.close()
+            who = ", ".join(dead) or "unknown"
+            raise RuntimeError(f"an environment worker died: process {who}; the rest was closed") from error
 
     def close(self) -> None:
         """Close every copy, in the workers too, and end the workers."""
@@ -166,6 +182,14 @@ class ParameterSharingVecEnv(SB3VecEnvWrapper):
         self.venv.close()
 
     # -- SB3's access to the copies ----------------------------------------------------------------------------------
+
+    def set_options(self, options: dict[str, Any] | None = None) -> None:
+        """Options for every copy's next reset."""
+        self._options = options
+
+    def has_attr(self, attr_name: str) -> bool:
+        """Whether the copies have an attribute."""
+        return attr_name == "render_mode" or all(hasattr(env.unwrapped, attr_name) for env in self._copies(None))
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """The attribute of each slot's copy; ``render_mode`` also with workers."""
@@ -196,7 +220,8 @@ class ParameterSharingVecEnv(SB3VecEnvWrapper):
         """Draw the first copy in the render mode it was made with; ``mode`` is there for SB3's sake and must agree."""
         if mode is not None and mode != self.render_mode:
             warnings.warn(f"mode {mode!r} is ignored: the env was made with render_mode={self.render_mode!r}", stacklevel=2)
-        return self.venv.render()
+        with self._guarded():
+            return self.venv.render()
 
     def getattr_recursive(self, name: str) -> Any:
         """Let SB3's wrappers around this one see its attributes."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, Protocol
 
 import numpy as np
@@ -51,17 +50,11 @@ class PolicyController:
 
 
 def fly(
-    controller: Controller,
-    scenario: Scenario,
-    episodes: int,
-    seed: int,
-    batch: int = BATCH,
-    on_batch: Callable[[int], None] | None = None,
+    controller: Controller, scenario: Scenario, episodes: int, seed: int, batch: int = BATCH
 ) -> dict[str, NDArray[np.float64]]:
     """Fly episodes 0 ... ``episodes - 1`` of a seed.
 
     :param batch: episodes flown at once; it changes no number
-    :param on_batch: called with the number of episodes done so far
     :return: each metric's value for each episode, ``(episodes,)``
     :raises SettingsError: for counts that are not accepted
     """
@@ -78,8 +71,6 @@ def fly(
             sensing, clipped = world.step(controller.act(sensing, scenario))
             metrics.update(sensing, own_reward(reward_terms(sensing, clipped, scenario)))
         results.append(metrics.result())
-        if on_batch is not None:
-            on_batch(numbers.stop)
     return {name: np.concatenate([result[name] for result in results]) for name in results[0]}
 
 

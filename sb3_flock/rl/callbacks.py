@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import defaultdict, deque
 from typing import Any
 
 import numpy as np
@@ -22,10 +22,11 @@ class NeighborInclusiveReward(BaseCallback):
 
     SB3 calls it after the env's step and before the transition is stored, and the rewards are rewritten in place: the
     replay buffer takes the mixed ones. The raw reward stays where it was, in ``rollout/ep_rew_mean`` and in each info's
-    ``reward`` key (put there by this callback); the mixed one is logged as ``rollout/ep_mixed_rew_mean``.
+    ``reward`` key (put there by this callback); the mixed one is logged as ``rollout/ep_mixed_rew_mean``. Both are means over
+    the last 100 episodes.
 
     :param lambda_: share of a vehicle's own reward, in [0, 1]
-    :param n_agents: agents in one copy of the env; found by itself on :func:`sb3_flock.flatten`'s vector envs
+    :param n_agents: agents in one copy of the env; needed only on vector envs that :func:`sb3_flock.flatten` did not make
     :param verbose: SB3's verbosity
     :raises SettingsError: for a share outside [0, 1]; at the start of the training, if the agents cannot be counted or the
         env is wrapped in ``VecNormalize``, which would store its own rewards and throw the mixed ones away
@@ -37,8 +38,9 @@ class NeighborInclusiveReward(BaseCallback):
             raise SettingsError(f"lambda_ = {lambda_}: input should be between 0 and 1")
         self.lambda_ = lambda_
         self.n_agents = n_agents
+        self._agents_per_copy = n_agents or 1
         self._returns = np.zeros(0)
-        self._finished: list[float] = []
+        self._finished: deque[float] = deque(maxlen=100)
 
     def _init_callback(self) -> None:
         if self.model.get_vec_normalize_env() is not None:
@@ -46,12 +48,14 @@ class NeighborInclusiveReward(BaseCallback):
                 "VecNormalize is not accepted: the replay buffer would take its rewards and not the neighbor-inclusive ones"
             )
         n_envs = self.training_env.num_envs
-        n_agents = self.n_agents or getattr(self.training_env, "n_agents", None)
-        if n_agents is None or n_envs % n_agents:
+        counted = getattr(self.training_env, "n_agents", None)
+        n_agents = self.n_agents or counted
+        if n_agents is None or n_envs % n_agents or n_agents != (counted or n_agents):
             raise SettingsError(
-                f"n_agents = {n_agents}: the number of agents in one copy of the env is needed, a divisor of {n_envs}"
+                f"n_agents = {n_agents}: the number of agents in one copy of the env is needed, "
+                + (f"which is {counted}" if counted else f"a divisor of {n_envs}")
             )
-        self.n_agents = n_agents
+        self._agents_per_copy = n_agents
         self._returns = np.zeros(n_envs)
 
     def _on_step(self) -> bool:
@@ -61,27 +65,23 @@ class NeighborInclusiveReward(BaseCallback):
         rewards[:] = self.mix(rewards, infos)
         self._returns += rewards
         if dones.any():
-            self._finished += self._returns[dones].tolist()
+            self._finished.extend(self._returns[dones].tolist())
             self._returns[dones] = 0.0
+            self.logger.record("rollout/ep_mixed_rew_mean", float(np.mean(self._finished)))
         return True
 
     def mix(self, rewards: np.ndarray, infos: list[dict[str, Any]]) -> np.ndarray:
         """The mixed reward of every slot of the vector env, ``(slots,)``."""
-        assert self.n_agents is not None
-        neighbors = np.zeros((len(infos), self.n_agents), dtype=bool)
+        n_agents = self._agents_per_copy
+        neighbors = np.zeros((len(infos), n_agents), dtype=bool)
         for slot, info in enumerate(infos):
             neighbors[slot, info.get("neighbors", ())] = True
-        by_copy = (-1, self.n_agents)
-        return mix_rewards(rewards.reshape(by_copy), neighbors.reshape(*by_copy, self.n_agents), self.lambda_).ravel()
-
-    def _on_rollout_end(self) -> None:
-        if self._finished:
-            self.logger.record_mean("rollout/ep_mixed_rew_mean", float(np.mean(self._finished)))
-            self._finished = []
+        by_copy = (-1, n_agents)
+        return mix_rewards(rewards.reshape(by_copy), neighbors.reshape(*by_copy, n_agents), self.lambda_).ravel()
 
 
 class FlockMetrics(BaseCallback):
-    """Logs the infos' ``metrics`` and ``reward_terms`` as ``flock/...``: means over all transitions since the last dump."""
+    """Logs the infos' ``metrics`` and ``reward_terms`` as ``flock/...``: means since an episode last ended."""
 
     def __init__(self, verbose: int = 0) -> None:
         super().__init__(verbose)

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
 from sb3_flock.settings import Settings
 from sb3_flock.sim import Scenario
 
+Width = Annotated[int, Field(ge=1)]
+
 
 class NetworkConfig(Settings):
     """The networks' shapes (paper, IV-C)."""
 
-    channels: tuple[int, int] = Field((16, 32), description="output channels of the two convolutions (open)")
+    channels: tuple[Width, Width] = Field((16, 32), description="output channels of the two convolutions (open)")
     kernel_size: int = Field(3, ge=1, description="side of the convolutions' kernels [anchors] (open)")
     stride: int = Field(2, ge=1, description="stride of the convolutions [anchors] (open)")
     features_dim: int = Field(128, ge=1, description="width of the dense layer behind the convolutions (open)")
-    net_arch: tuple[int, ...] = Field((64,), description="widths of the hidden layers behind the features (open)")
+    net_arch: tuple[Width, ...] = Field((64,), description="widths of the hidden layers behind the features (open)")
     action_layer: int = Field(32, ge=1, description="width of the critic's hidden layer for the action (open)")
     layer_norm: bool = Field(True, description="normalize the dense layer's output (ours; paper: no)")
     final_init: float | None = Field(
@@ -36,8 +38,8 @@ class LearnerConfig(Settings):
     learning_rate: float = Field(5e-4, gt=0, description="Adam's learning rate at the start (open)")
     final_learning_rate: float = Field(0.0, ge=0, description="learning rate at the end, reached linearly (open)")
     batch_size: int = Field(128, ge=1, description="transitions in a minibatch (open)")
-    buffer_size: int = Field(300_000, ge=1, description="transitions the shared replay buffer holds (open)")
-    learning_starts: int = Field(4_000, ge=0, description="transitions flown at random before learning (open)")
+    buffer_size: int = Field(250_000, ge=1, description="transitions the shared replay buffer holds (open)")
+    learning_starts: int = Field(4_000, ge=0, description="transitions flown with random actions before learning (open)")
     gamma: float = Field(0.98, ge=0, lt=1, description="discount factor (open)")
     tau: float = Field(0.005, gt=0, le=1, description="update rate of the target networks (open)")
     n_steps: int = Field(1, ge=1, description="steps of the return in the critic's target (paper: 1)")
@@ -53,22 +55,26 @@ class PracticeConfig(Settings):
     """How the scenario flown while training differs from the task, which is never changed itself.
 
     With the paper's walk an obstacle seldom meets the flock, and a policy that keeps exactly the minimum separation breaks it
-    at the slightest error: practice is harder than the task. ``0``, ``1`` and ``1`` train on the task as it is.
+    at the slightest error: practice is harder than the task. In a large flock everyone's exploration disturbs everyone, and
+    packs that are loose enough to bear it are what is learned: practice flies fewer vehicles.
     """
 
-    extra_obstacles: int = Field(2, ge=0, description="obstacles added, where the task has any (ours; paper: 0)")
+    max_vehicles: int = Field(
+        4, ge=1, description="vehicles flown at most; the policy fits any number, and small flocks teach it sooner (ours)"
+    )
+    extra_obstacles: int = Field(1, ge=0, description="obstacles added, where the task has any (ours; paper: 0)")
     obstacle_arena_ratio: float = Field(
         0.5, gt=0, description="side of the obstacles' square, relative to the task's (ours; paper: 1)"
     )
     separation_ratio: float = Field(
-        1.04, ge=1, description="minimum separation to neighbors, relative to the task's (ours; paper: 1)"
+        1.06, ge=1, description="minimum separation to neighbors, relative to the task's (ours; paper: 1)"
     )
 
 
 class TrainingConfig(Settings):
-    """A training run: the task, the learner and the bookkeeping. All frequencies and totals count transitions.
+    """A training run: the task, the learner and the bookkeeping. Totals and the frequencies of saving count transitions.
 
-    One transition is one step of one vehicle: a vector step of ``n_flocks`` flocks adds ``n_flocks * n_vehicles``.
+    One transition is one step of one vehicle: a vector step of ``n_flocks`` flocks adds that many times the vehicles flown.
 
     :raises SettingsError: one line naming the parameter, its value and what is accepted
     """
@@ -79,10 +85,10 @@ class TrainingConfig(Settings):
     learner: LearnerConfig = Field(default_factory=LearnerConfig, description="the learner")
     network: NetworkConfig = Field(default_factory=NetworkConfig, description="the networks")
 
-    total_timesteps: int = Field(300_000, ge=1, description="transitions to train for")
+    total_timesteps: int = Field(250_000, ge=1, description="transitions to train for")
     n_flocks: int = Field(8, ge=1, description="flocks flown side by side")
     num_cpus: int = Field(0, ge=0, description="SuperSuit worker processes; 0: fly in the training process (faster)")
-    seed: int = Field(0, ge=0, description="seed of the networks, the noise and the flocks")
+    seed: int = Field(0, ge=0, le=2**32 - 1, description="seed of the networks, the noise and the flocks")
     device: str = Field("cpu", description="torch device: cpu, cuda, cuda:0, ... or auto")
     torch_threads: int = Field(1, ge=0, description="torch threads; 1 is fastest for networks this small; 0: torch's choice")
 
@@ -94,10 +100,11 @@ class TrainingConfig(Settings):
     output_dir: str = Field("runs", description="folder of the run folders")
 
     def flown_scenario(self) -> Scenario:
-        """The scenario flown while training: ``scenario`` made harder as ``practice`` says."""
+        """The scenario flown while training: ``scenario`` changed as ``practice`` says."""
         scenario, practice = self.scenario, self.practice
         return scenario.replace(
+            n_vehicles=min(scenario.n_vehicles, practice.max_vehicles),
             n_obstacles=scenario.n_obstacles + (practice.extra_obstacles if scenario.n_obstacles else 0),
-            obstacle_arena=scenario.obstacle_arena * practice.obstacle_arena_ratio,
+            obstacle_arena=scenario.obstacle_half_side * practice.obstacle_arena_ratio,
             neighbor_separation=min(scenario.neighbor_separation * practice.separation_ratio, scenario.link_range),
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -11,6 +12,15 @@ import yaml
 from sb3_flock.settings import Settings, SettingsError, nearest, resolve_path
 
 _Settings = TypeVar("_Settings", bound=Settings)
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML's safe loader, but 1e-3 is the number it looks like; YAML 1.1 would have it a string."""
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"^[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]+$"), list("-+.0123456789")
+)
 
 
 def load_config(
@@ -50,8 +60,8 @@ def parse_overrides(assignments: Iterable[str]) -> dict[str, Any]:
         if not equals or not key:
             raise SettingsError(f"--set {assignment}: KEY=VALUE is needed, such as reward.lambda_=0.5")
         try:
-            overrides[key] = _number(yaml.safe_load(text))
-        except yaml.YAMLError:
+            overrides[key] = yaml.load(text, _Loader)
+        except (yaml.YAMLError, ValueError):
             raise SettingsError(f"--set {assignment}: the value is not YAML") from None
     return overrides
 
@@ -75,31 +85,16 @@ def _lines(config: Settings, indent: str) -> Iterable[str]:
 
 def _read_yaml(path: Path) -> dict[str, Any]:
     try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+        values = yaml.load(path.read_text(encoding="utf-8"), _Loader)
     except OSError as error:
         raise SettingsError(f"config {path}: {error.strerror or error}") from None
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise SettingsError(f"config {path}: not a YAML file ({' '.join(str(error).split())})") from None
     if values is None:
         return {}
     if not isinstance(values, dict):
         raise SettingsError(f"config {path}: a mapping of parameters is needed")
-    numbers: dict[str, Any] = _number(values)
-    return numbers
-
-
-def _number(value: Any) -> Any:
-    """YAML 1.1 reads ``1e-3`` as a string; here it is the number it looks like."""
-    if isinstance(value, dict):
-        return {key: _number(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_number(item) for item in value]
-    if isinstance(value, str):
-        try:
-            return float(value)
-        except ValueError:
-            return value
-    return value
+    return values
 
 
 def _check_groups(settings: type[Settings], values: Mapping[str, Any], prefix: str) -> None:

@@ -9,6 +9,8 @@ from gymnasium import spaces
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
+from sb3_flock.settings import SettingsError
+
 
 class FlockCNN(BaseFeaturesExtractor):
     """Two convolutions with ReLU and one dense layer: three of the state path's four hidden layers (paper, IV-C).
@@ -22,6 +24,7 @@ class FlockCNN(BaseFeaturesExtractor):
     :param kernel_size: side of the convolutions' kernels
     :param stride: stride of both convolutions
     :param layer_norm: normalize the dense layer's output before its ReLU (ours; off in the paper)
+    :raises SettingsError: if the convolutions do not fit the tensor
     """
 
     def __init__(
@@ -34,7 +37,7 @@ class FlockCNN(BaseFeaturesExtractor):
         layer_norm: bool = False,
     ) -> None:
         if len(observation_space.shape) != 3:
-            raise ValueError(f"FlockCNN needs observations of shape (channels, l, l), not {observation_space.shape}")
+            raise SettingsError(f"FlockCNN needs observations of shape (channels, l, l), not {observation_space.shape}")
         super().__init__(observation_space, features_dim)
         layers: list[nn.Module] = []
         in_channels = observation_space.shape[0]
@@ -46,7 +49,7 @@ class FlockCNN(BaseFeaturesExtractor):
             try:
                 n_flatten = self.cnn(th.zeros(1, *observation_space.shape)).shape[1]
             except RuntimeError:
-                raise ValueError(
+                raise SettingsError(
                     f"FlockCNN: {len(channels)} convolutions of kernel {kernel_size} and stride {stride} do not fit a "
                     f"tensor of {observation_space.shape[1:]} anchors; more anchors or a smaller kernel are needed"
                 ) from None

@@ -56,7 +56,7 @@ class ActionLayerCritic(ContinuousCritic):
 
 
 class _InvertingClamp(th.autograd.Function):
-    """Clamps to [-1, 1]; the gradient shrinks as it pushes towards a bound and turns around beyond it."""
+    """Clamps to [-1, 1]; a gradient that pushes outward fades at the bound and turns around beyond it."""
 
     @staticmethod
     def forward(ctx: Any, raw: th.Tensor) -> th.Tensor:
@@ -66,15 +66,20 @@ class _InvertingClamp(th.autograd.Function):
     @staticmethod
     def backward(ctx: Any, gradient: th.Tensor) -> th.Tensor:
         (raw,) = ctx.saved_tensors
-        room = th.where(gradient < 0, 1.0 - raw, 1.0 + raw)  # descent along a negative gradient raises the output
-        return gradient * room / 2
+        # Descent along a negative gradient raises the output, so that is the side whose bound counts.
+        room = th.where(gradient < 0, 1.0 - raw, 1.0 + raw)
+        return gradient * (room / _FADE).clamp(-1.0, 1.0)
+
+
+_FADE = 0.1
+"""Distance from the bound at which an outward gradient starts to fade."""
 
 
 class InvertingBound(nn.Module):
-    """The actor's action bound: a clamp to [-1, 1] with inverting gradients (Hausknecht and Stone, 2016).
+    """The actor's action bound: a clamp to [-1, 1] with inverting gradients (after Hausknecht and Stone, 2016).
 
     A tanh saturates here: standing still is a bound of the speed, its input runs off to -10 and beyond, and no gradient ever
-    calls it back. A clamp with inverting gradients reaches the bound exactly and leaves it as soon as the critic prefers to.
+    calls it back. This bound is reached exactly and left as soon as the critic prefers to.
     """
 
     def forward(self, raw: th.Tensor) -> th.Tensor:

@@ -11,7 +11,7 @@ import os
 import platform
 import warnings
 import zipfile
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -24,15 +24,17 @@ from stable_baselines3.common.policies import BasePolicy
 from sb3_flock.envs.flocking_v0 import action_space, observation_space
 from sb3_flock.rl.algorithms import ALGORITHMS, policy_kwargs
 from sb3_flock.rl.config import TrainingConfig
-from sb3_flock.settings import SettingsError
+from sb3_flock.settings import SettingsError, UserError
 from sb3_flock.sim import Scenario
 
 MEMBER = "flock.json"
+FORMAT = 1
+"""Version of the member's layout."""
 PACKAGES = ("sb3_flock", "stable_baselines3", "torch", "gymnasium", "pettingzoo", "supersuit", "numpy")
 
 
-class PolicyError(ValueError):
-    """A policy file cannot be used; one line for the user."""
+class PolicyError(UserError):
+    """A policy file cannot be used."""
 
 
 @dataclass(frozen=True)
@@ -44,8 +46,6 @@ class LoadedPolicy:
     config: TrainingConfig
     versions: dict[str, str]
     num_timesteps: int
-    parameters: dict[str, Any] = field(repr=False)
-    """The state dicts of the file's modules by name, as SB3's ``set_parameters`` takes them."""
 
     @property
     def scenario(self) -> Scenario:
@@ -90,7 +90,7 @@ def save_model(model: BaseAlgorithm, path: str | Path, config: TrainingConfig) -
     with open(aside, "wb") as file:
         model.save(file)
     member = {
-        "format": 1,
+        "format": FORMAT,
         "config": config.model_dump(mode="json"),
         "num_timesteps": model.num_timesteps,
         "versions": versions(),
@@ -109,7 +109,7 @@ def check_device(device: str) -> None:
     :raises SettingsError: if not
     """
     try:
-        th.empty(0, device=None if device == "auto" else device)
+        th.ones(1, device=None if device == "auto" else device).item()
     except (RuntimeError, AssertionError) as error:  # torch built without CUDA asserts
         raise SettingsError(f"device = {device!r}: {_first_line(error)}") from None
 
@@ -143,25 +143,24 @@ def load_policy(path: str | Path, device: str = "cpu") -> LoadedPolicy:
     try:
         with zipfile.ZipFile(path) as archive:
             member = json.loads(archive.read(MEMBER))
-            names = [name for name in archive.namelist() if name.endswith(".pth") and name != "pytorch_variables.pth"]
-            parameters = {}
-            for name in names:
-                with archive.open(name) as file:
-                    parameters[name.removesuffix(".pth")] = th.load(file, map_location=device, weights_only=True)
-    except KeyError:
-        raise PolicyError(f"{path}: not a policy of sb3_flock (it has no {MEMBER})") from None
+            with archive.open("policy.pth") as file:
+                weights = th.load(file, map_location=device, weights_only=True)
+    except KeyError as error:
+        raise PolicyError(f"{path}: not a policy of sb3_flock ({_first_line(error)})") from None
     except Exception as error:  # zipfile, json and torch raise many kinds for a damaged file; all mean the same here
         raise PolicyError(f"{path}: damaged or not a policy file ({_first_line(error)})") from None
     try:
+        if member["format"] != FORMAT:
+            raise SettingsError(f"format = {member['format']!r}: this version reads {FORMAT}")
         config = TrainingConfig(**member["config"])
         policy = _build_policy(config)
-        policy.load_state_dict(parameters["policy"])
-    except (SettingsError, KeyError, TypeError, RuntimeError, AttributeError) as error:
+        policy.load_state_dict(weights)
+    except (ValueError, KeyError, TypeError, RuntimeError, AttributeError) as error:
         raise PolicyError(f"{path}: its networks do not fit what it says of itself ({_first_line(error)})") from None
     if not all(bool(th.isfinite(tensor).all()) for tensor in policy.state_dict().values()):
         raise PolicyError(f"{path}: its weights are not finite")
     policy.to(device).set_training_mode(False)
-    return LoadedPolicy(path, policy, config, member.get("versions", {}), member.get("num_timesteps", 0), parameters)
+    return LoadedPolicy(path, policy, config, member.get("versions", {}), member.get("num_timesteps", 0))
 
 
 def _build_policy(config: TrainingConfig) -> BasePolicy:

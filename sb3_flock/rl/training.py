@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from rich.console import Console
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.vec_env import VecMonitor
+from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
 from sb3_flock.envs.vec_env import make_vec_env
 from sb3_flock.evaluation.episodes import PolicyController, fly
@@ -26,7 +27,7 @@ from sb3_flock.rl.config_io import to_yaml
 from sb3_flock.rl.progress import FlockProgress
 from sb3_flock.rl.saving import PolicyError, check_device, load_policy, save_model, versions
 from sb3_flock.settings import SettingsError
-from sb3_flock.sim import World, episode_rng
+from sb3_flock.sim import Scenario, World, episode_rng
 
 SELECTION_SEED = 1_000_000
 """Seed of the episodes on which the best model is chosen; no result is reported on them."""
@@ -57,7 +58,7 @@ def train(
 
     :param config: everything that decides the run
     :param console: where progress goes; the default prints to stderr
-    :param command: the command line, for ``command.txt``
+    :param command: the words of the command line, for ``command.txt``
     :param callbacks: further SB3 callbacks, called after ours
     :raises SettingsError: for a device or a folder that cannot be used
     :raises PolicyError: for a policy to start from that cannot be used
@@ -66,28 +67,17 @@ def train(
     console = console or Console(stderr=True)
     if config.torch_threads:
         th.set_num_threads(config.torch_threads)
-    initial = None if config.init_from is None else load_policy(config.init_from)
     check_device(config.device)
     flown = config.flown_scenario()
     for scenario in (config.scenario, flown):  # too crowded to start? Better told before the run folder is made
         World(scenario).reset([episode_rng(config.seed, 0)])
     env = VecMonitor(make_vec_env(flown, config.n_flocks, config.num_cpus, seed=config.seed))
-    folder = _new_run_folder(config)
     try:
-        model = build_model(config, env)
-        if initial is not None:
-            try:
-                model.policy.load_state_dict(initial.parameters["policy"])
-            except RuntimeError:
-                raise PolicyError(f"{initial.path}: its networks are not those of this config (init_from)") from None
+        model = _build(config, env)
+        folder = _new_run_folder(config)
         model.set_logger(configure(str(folder), ["tensorboard", "csv"]))
         _describe_run(folder, config, command)
-        console.print(
-            f"{config.algo} on {config.scenario.n_vehicles} vehicles, {config.scenario.n_obstacles} obstacles, "
-            f"{config.n_flocks} flocks; device {model.device}, torch threads {th.get_num_threads()}; {folder}",
-            soft_wrap=True,
-            highlight=False,
-        )
+        console.print(_summary(config, flown, model, folder), soft_wrap=True, highlight=False)
         progress = FlockProgress(console, config.total_timesteps)
         parts: list[BaseCallback] = [
             NeighborInclusiveReward(flown.reward.lambda_),
@@ -118,15 +108,14 @@ class Evaluation(BaseCallback):
         super().__init__()
         self.config, self.folder, self.progress = config, folder, progress
         self.best_score = np.inf
-        self._due = config.eval_freq
+        self._due = _Due(config.eval_freq)
         self._history: dict[str, list[Any]] = {"timesteps": [], "results": [], "ep_lengths": []}
 
     def _on_step(self) -> bool:
         return True
 
     def _on_rollout_end(self) -> None:
-        if self.config.eval_freq and self.num_timesteps >= self._due:
-            self._due = self.num_timesteps - self.num_timesteps % self.config.eval_freq + self.config.eval_freq
+        if self._due(self.num_timesteps):
             self._evaluate()
 
     def _on_training_end(self) -> None:
@@ -165,15 +154,52 @@ class Checkpoints(BaseCallback):
     def __init__(self, config: TrainingConfig, folder: Path) -> None:
         super().__init__()
         self.config, self.folder = config, folder
-        self._due = config.save_freq
+        self._due = _Due(config.save_freq)
 
     def _on_step(self) -> bool:
         return True
 
     def _on_rollout_end(self) -> None:
-        if self.config.save_freq and self.num_timesteps >= self._due:
-            self._due = self.num_timesteps - self.num_timesteps % self.config.save_freq + self.config.save_freq
+        if self._due(self.num_timesteps):
             save_model(self.model, self.folder / f"rl_model_{self.num_timesteps}_steps.zip", self.config)
+
+
+class _Due:
+    """Tells when another ``freq`` transitions have been flown; never if ``freq`` is 0."""
+
+    def __init__(self, freq: int) -> None:
+        self.freq = freq
+        self._next = freq
+
+    def __call__(self, num_timesteps: int) -> bool:
+        if not self.freq or num_timesteps < self._next:
+            return False
+        self._next = num_timesteps - num_timesteps % self.freq + self.freq
+        return True
+
+
+def _build(config: TrainingConfig, env: VecEnv) -> OffPolicyAlgorithm:
+    """The model, with the weights of ``init_from`` where there is one."""
+    try:
+        model = build_model(config, env)
+    except MemoryError:
+        raise SettingsError(f"buffer_size = {config.learner.buffer_size}: more than this machine's memory") from None
+    if config.init_from is not None:
+        initial = load_policy(config.init_from)
+        initial.check(config.scenario)
+        if (initial.config.network, initial.config.algo) != (config.network, config.algo):
+            raise PolicyError(f"{initial.path}: its algorithm or networks are not those of this config (init_from)")
+        model.policy.load_state_dict(initial.policy.state_dict())
+    return model
+
+
+def _summary(config: TrainingConfig, flown: Scenario, model: OffPolicyAlgorithm, folder: Path) -> str:
+    """What is trained, on what, where: one line."""
+    return (
+        f"{config.algo} for {config.scenario.n_vehicles} vehicles, {config.scenario.n_obstacles} obstacles; practice in "
+        f"{config.n_flocks} flocks of {flown.n_vehicles} among {flown.n_obstacles}; device {model.device}, "
+        f"torch threads {th.get_num_threads()}; {folder}"
+    )
 
 
 def _new_run_folder(config: TrainingConfig) -> Path:
@@ -198,5 +224,5 @@ def _new_run_folder(config: TrainingConfig) -> Path:
 
 def _describe_run(folder: Path, config: TrainingConfig, command: Sequence[str] | None) -> None:
     (folder / "config.yaml").write_text(to_yaml(config), encoding="utf-8")
-    (folder / "command.txt").write_text(" ".join(command or sys.argv) + "\n", encoding="utf-8")
+    (folder / "command.txt").write_text(shlex.join(command or sys.argv) + "\n", encoding="utf-8")
     (folder / "versions.txt").write_text("".join(f"{name}=={number}\n" for name, number in versions().items()))

@@ -12,13 +12,11 @@ if TYPE_CHECKING:
     from sb3_flock.sim.scenario import Scenario
     from sb3_flock.sim.sensing import Sensing
 
-CHANNELS = ("neighbors", "obstacles", "waypoint")
-
 
 def observe(sensing: Sensing, scenario: Scenario) -> NDArray[np.float32]:
     """The observation I_N, I_O, I_W of every vehicle (section IV-A).
 
-    ``obs[..., c, a, b]`` is channel c (in the order of :data:`CHANNELS`) at the anchor number a along the body's x axis
+    ``obs[..., c, a, b]`` is channel c (0 neighbors, 1 obstacles, 2 waypoint) at the anchor number a along the body's x axis
     (forward) and b along its y axis (left), both from -r to +r, ends included. Each anchor adds up
     exp(-|d|^2 / (2 sigma^2)) over the bodies within sensing range; sigma is ``anchor_width`` anchor spacings. A waypoint
     beyond ``goal_radius`` shows on the circle of that radius, so that its bearing is always visible.

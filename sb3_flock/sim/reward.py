@@ -21,14 +21,14 @@ class RewardWeights(Settings):
 
     link_bonus: float = Field(1.0, ge=0, description="reward for each neighbor at a safe distance (paper, IV-B: 1)")
     separation_penalty: float = Field(
-        3.0, ge=0, description="penalty for each neighbor nearer than neighbor_separation (paper, IV-B: 1)"
+        4.0, ge=0, description="penalty for each neighbor nearer than neighbor_separation (paper, IV-B: 1)"
     )
     obstacle_penalty: float = Field(
         3.0, ge=0, description="penalty for each obstacle nearer than obstacle_separation (paper, IV-B: 1)"
     )
     epsilon: float = Field(10.0, ge=0, description="weight of the distance to the waypoint [1/m] (paper leaves it open)")
     beta: float = Field(
-        -0.03, le=0, description="weight of the squared action [m/s, rad/s], not positive (paper leaves it open)"
+        -0.02, le=0, description="weight of the squared action [m/s, rad/s], not positive (paper leaves it open)"
     )
     lambda_: float = Field(
         0.7, ge=0, le=1, description="share of a vehicle's own reward in the mix with its neighbors' (open)"

@@ -36,8 +36,8 @@ class Scenario(Settings):
     waypoint_speed: float = Field(0.1, ge=0, description="speed of the waypoint towards the origin [m/s] (paper, V)")
 
     arena: float = Field(1.0, gt=0, description="half side of the square in which all bodies start [m] (paper, V)")
-    obstacle_arena: float = Field(
-        1.0, gt=0, description="half side of the square in which obstacles start and walk [m] (paper, V: the arena)"
+    obstacle_arena: float | None = Field(
+        None, gt=0, description="half side of the square in which obstacles start and walk [m]; null: arena (paper, V)"
     )
     link_range: float = Field(0.15, gt=0, description="proximity network threshold r_n [m] (paper, V)")
     neighbor_separation: float = Field(0.1, ge=0, description="minimum separation to neighbors r_n' [m] (paper, V)")
@@ -66,6 +66,11 @@ class Scenario(Settings):
             if getattr(self, near) > getattr(self, far):
                 raise ValueError(f"{near} = {getattr(self, near)}: input should be at most {far} = {getattr(self, far)}")
         return self
+
+    @property
+    def obstacle_half_side(self) -> float:
+        """Half side of the square in which obstacles start and walk [m]."""
+        return self.arena if self.obstacle_arena is None else self.obstacle_arena
 
     @property
     def channel_radii(self) -> tuple[float, float, float]:

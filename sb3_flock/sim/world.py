@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sb3_flock.settings import UserError
 from sb3_flock.sim.sensing import Sensing, sense
 
 if TYPE_CHECKING:
@@ -19,8 +20,8 @@ _MAX_REDRAWS = 1000
 """Draws allowed for one body's start before the arena counts as too crowded."""
 
 
-class WorldError(ValueError):
-    """The scenario leaves no room to start; one line for the user."""
+class WorldError(UserError):
+    """The scenario leaves no room to start."""
 
 
 def episode_rng(seed: int, episode: int) -> Generator:
@@ -105,7 +106,7 @@ class World:
 
     def _move_obstacles(self, dt: float) -> None:
         """The random walk: a unicycle with drawn speed and turn rate, turned back at the edge of its square."""
-        bound = self.scenario.obstacle_arena
+        bound = self.scenario.obstacle_half_side
         positions, headings = _unicycle(
             self.obstacle_positions,
             self.obstacle_headings,
@@ -127,7 +128,12 @@ class World:
         obstacles = np.empty((scenario.n_obstacles, 2))
         for o in range(scenario.n_obstacles):
             obstacles[o] = _draw_apart(
-                rng, scenario.obstacle_arena, positions, scenario.obstacle_separation, "n_obstacles", scenario.n_obstacles
+                rng,
+                scenario.obstacle_half_side,
+                positions,
+                scenario.obstacle_separation,
+                "n_obstacles",
+                scenario.n_obstacles,
             )
         headings = rng.uniform(-np.pi, np.pi, scenario.n_vehicles)
         obstacle_headings = rng.uniform(-np.pi, np.pi, scenario.n_obstacles)

@@ -8,6 +8,7 @@ from gymnasium.utils.env_checker import data_equivalence
 from sb3_flock import flocking_v0
 from sb3_flock.settings import SettingsError
 from sb3_flock.sim import Scenario, mix_rewards
+from sb3_flock.sim.sensing import is_connected
 
 with warnings.catch_warnings():  # importing PettingZoo's tests imports its deprecated modules
     warnings.simplefilter("ignore", DeprecationWarning)
@@ -115,6 +116,7 @@ def test_infos_tell_neighbors_terms_and_metrics():
             assert metrics["nearest_obstacle"] == pytest.approx(to_obstacles[i].min())
             assert metrics["neighbor_violation"] == (distances[i].min() < 0.05)
             assert metrics["obstacle_violation"] == (to_obstacles[i].min() < 0.15)
+            assert metrics["connected"] == bool(is_connected((distances < scenario.link_range)[None])[0])
             assert metrics["tracking_error"] == pytest.approx(np.linalg.norm(positions[i] - env.world.waypoints[0]))
     assert some_neighbors
 

@@ -177,6 +177,10 @@ def test_attributes_and_methods_of_the_copies_are_reachable_through_wrappers():
     assert [getattr(copy, "marker", 0) for copy in (e.par_env for e in env.venv.venv.vec_envs)] == [0, 1]
     assert env.env_method("action_space", "vehicle_0", indices=0) == [env.action_space]
     assert env.env_is_wrapped(VecMonitor) == [False] * 6
+    assert env.has_attr("scenario")
+    assert not env.has_attr("no_such_thing")
+    env.set_options({"any": "thing"})
+    env.reset()
     assert len(env.get_images()) == 2
     assert env.render("rgb_array").ndim == 3
     with pytest.raises(AttributeError):
@@ -235,17 +239,17 @@ def test_a_killed_worker_is_one_clear_error_and_the_rest_is_closed():
 
 
 class SaysGoodbye(flocking_v0.parallel_env):
-    """Leaves a file when it is closed."""
+    """Leaves a file named for its process when it is closed."""
 
     def close(self):
-        if getattr(self, "farewell", None):
-            self.farewell.write_text("closed")
+        if getattr(self, "farewells", None):
+            (self.farewells / str(os.getpid())).touch()
         super().close()
 
 
 def test_closing_closes_the_workers_envs(tmp_path):
     template = SaysGoodbye(SCENARIO)
-    template.farewell = tmp_path / "farewell"
+    template.farewells = tmp_path
     env = flatten(template, n_copies=2, num_cpus=2, seed=0)
     env.reset()
     procs = env.venv.procs
@@ -253,7 +257,7 @@ def test_closing_closes_the_workers_envs(tmp_path):
     env.close()
     env.close()  # twice is fine
     assert time.monotonic() - started < 10
-    assert (tmp_path / "farewell").exists()
+    assert {path.name for path in tmp_path.iterdir()} >= {str(proc.pid) for proc in procs}
     assert not any(proc.is_alive() for proc in procs)
 
 
@@ -273,7 +277,10 @@ def test_slots_are_ordered_copy_by_copy_and_actions_go_to_their_vehicle():
     assert moved[1].tolist() == [False, True, False]
 
 
-@pytest.mark.parametrize(("kwargs", "name"), [({"n_flocks": 0}, "n_copies = 0"), ({"num_cpus": -1}, "num_cpus = -1")])
+BAD_COUNTS = [({"n_flocks": 0}, "n_flocks = 0"), ({"num_cpus": -1}, "num_cpus = -1"), ({"seed": -1}, "seed = -1")]
+
+
+@pytest.mark.parametrize(("kwargs", "name"), BAD_COUNTS)
 def test_bad_counts_are_told_in_one_line(kwargs, name):
     with pytest.raises(SettingsError, match=name):
         make_vec_env(SCENARIO, **kwargs)

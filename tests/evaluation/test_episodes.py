@@ -61,12 +61,6 @@ def test_bad_counts_are_told_in_one_line(kwargs, name):
         evaluate(GoToWaypoint(), SCENARIO, **{"episodes": 1, **kwargs})
 
 
-def test_batches_are_reported():
-    done = []
-    fly(GoToWaypoint(), SCENARIO.replace(max_cycles=2), 25, seed=0, batch=10, on_batch=done.append)
-    assert done == [10, 20, 25]
-
-
 def test_a_policy_controller_gives_each_vehicle_its_own_action(network):
     from sb3_flock.sim import World, episode_rng, observe
 

@@ -1,3 +1,4 @@
+import gymnasium
 import numpy as np
 import pytest
 from mpe2 import simple_spread_v3
@@ -5,7 +6,7 @@ from stable_baselines3 import DDPG
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.noise import NormalActionNoise
-from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
 from sb3_flock import FlockCNN, NeighborInclusiveReward, Scenario, flatten, make_vec_env
 from sb3_flock.rl.callbacks import FadingNoise, FlockMetrics
@@ -74,13 +75,20 @@ def test_neighbors_at_the_end_of_an_episode_are_those_of_its_last_step():
     model = learn(make_vec_env(CROWDED, n_flocks=2, seed=2), [NeighborInclusiveReward(0.5), record], 10, FlockCNN)
     _, infos, dones = record.steps[4]
     assert dones.all()
+    # The neighbor channel of the last observation tells the neighbors, whatever the infos say.
+    for info in infos:
+        assert (len(info["neighbors"]) > 0) == (info["terminal_observation"][0].max() > 0)
     np.testing.assert_allclose(model.replay_buffer.rewards[4], expected_mix(infos, 4, 0.5), rtol=1e-5)
 
 
 def test_it_works_with_n_step_returns():
     record = Record()
     model = learn(make_vec_env(CROWDED, n_flocks=1, seed=3), [NeighborInclusiveReward(0.5), record], 5, FlockCNN, n_steps=3)
-    np.testing.assert_allclose(model.replay_buffer.rewards[2], expected_mix(record.steps[2][1], 4, 0.5), rtol=1e-5)
+    mixed = np.array([expected_mix(infos, 4, 0.5) for _, infos, _ in record.steps[:3]])
+    sample = model.replay_buffer._get_samples(np.zeros(64, dtype=int))  # returns of three steps from the first one on
+    returns = mixed[0] + 0.99 * mixed[1] + 0.99**2 * mixed[2]
+    for value in sample.rewards.numpy().ravel():
+        assert np.isclose(returns, value, rtol=1e-4).any()
 
 
 def spread_env():
@@ -118,16 +126,19 @@ def test_without_the_key_an_agent_keeps_its_reward():
 
 
 def test_the_mixed_return_is_logged_under_its_own_name(tmp_path):
+    record = Record()
     env = VecMonitor(make_vec_env(CROWDED, n_flocks=1, seed=1))
     model = DDPG(
         "MlpPolicy", env, policy_kwargs={"features_extractor_class": FlockCNN}, buffer_size=500, device="cpu", seed=0
     )
     model.set_logger(configure(str(tmp_path), ["csv"]))
-    model.learn(4 * 21, callback=[NeighborInclusiveReward(0.3), FlockMetrics()], log_interval=4)
+    model.learn(4 * 21, callback=[NeighborInclusiveReward(0.3), FlockMetrics(), record], log_interval=4)
     model.logger.close()
     header, *rows = (tmp_path / "progress.csv").read_text().splitlines()
     logged = [dict(zip(header.split(","), row.split(","), strict=False)) for row in rows]
-    assert any(row["rollout/ep_mixed_rew_mean"] not in ("", row["rollout/ep_rew_mean"]) for row in logged)
+    mixed = np.sum([expected_mix(infos, 4, 0.3) for _, infos, _ in record.steps[:5]], axis=0).mean()
+    assert float(logged[0]["rollout/ep_mixed_rew_mean"]) == pytest.approx(mixed, rel=1e-3)
+    assert float(logged[0]["rollout/ep_rew_mean"]) != pytest.approx(mixed, rel=1e-3)
     assert any(row["flock/tracking_error"] for row in logged)
     assert any(row["flock/connectivity"] for row in logged)
 
@@ -140,8 +151,12 @@ def test_vec_normalize_is_refused():
 
 def test_agents_that_cannot_be_counted_are_told():
     env = make_vec_env(CROWDED, n_flocks=1, seed=1)
-    with pytest.raises(SettingsError, match="n_agents = 3.*divisor of 4"):
-        learn(env, NeighborInclusiveReward(n_agents=3), 1, FlockCNN)
+    for wrong in (3, 2):
+        with pytest.raises(SettingsError, match=f"n_agents = {wrong}.*which is 4"):
+            learn(env, NeighborInclusiveReward(n_agents=wrong), 1, FlockCNN)
+    foreign = DummyVecEnv([lambda: gymnasium.make("Pendulum-v1")])
+    with pytest.raises(SettingsError, match="n_agents = None.*divisor of 1"):
+        learn(foreign, NeighborInclusiveReward(), 1)
 
 
 @pytest.mark.parametrize("lambda_", [-0.1, 1.1, float("nan")])

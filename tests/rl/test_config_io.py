@@ -13,7 +13,7 @@ def write(tmp_path, text):
 
 
 def test_yaml_round_trips_and_every_key_has_its_comment(tmp_path):
-    config = load_config(TrainingConfig, overrides={"n_vehicles": 7, "net_arch": [32, 16]})
+    config = load_config(TrainingConfig, overrides={"n_vehicles": 7, "net_arch": [32, 16], "output_dir": "2024"})
     text = to_yaml(config)
     assert load_config(TrainingConfig, write(tmp_path, text)) == config
     assert all(" # " in line for line in text.splitlines())
@@ -49,6 +49,10 @@ def test_overrides_are_yaml_and_1e_3_is_a_number():
         ("a: [", "not a YAML file"),
         ("!!python/object/apply:os.system ['true']", "not a YAML file"),
         ("algo: ppo\n", "algo = 'ppo'"),
+        ("output_dir: 2021-13-45\n", "not a YAML file"),
+        ("scenario: &a\n  reward: *a\n", "reward"),
+        ("network:\n  net_arch: [-1]\n", "net_arch"),
+        ("seed: 4294967296\n", "seed = 4294967296"),
         ("practice:\n  separation_ratio: 0.5\n", "separation_ratio = 0.5"),
     ],
 )
@@ -63,10 +67,17 @@ def test_a_missing_file_is_one_line(tmp_path):
         load_config(TrainingConfig, tmp_path / "none.yaml")
 
 
-@pytest.mark.parametrize("assignment", ["gamma", "=3", "gamma=["])
+@pytest.mark.parametrize("assignment", ["gamma", "=3", "gamma=[", "gamma=2021-13-45"])
 def test_a_wrong_override_is_one_line(assignment):
     with pytest.raises(SettingsError, match="--set"):
         parse_overrides([assignment])
+
+
+def test_practice_flies_fewer_vehicles_but_never_more():
+    for n_vehicles, flown in ((2, 2), (3, 3), (9, 3)):
+        config = load_config(TrainingConfig, overrides={"n_vehicles": n_vehicles, "max_vehicles": 3})
+        assert config.flown_scenario().n_vehicles == flown
+        assert config.scenario.n_vehicles == n_vehicles
 
 
 def test_practice_is_harder_than_the_task_and_scales_with_it():

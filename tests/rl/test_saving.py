@@ -76,8 +76,9 @@ def broken_files(saved):
         ({"flock.json": b"[]"}, "do not fit"),
         ({"flock.json": json.dumps(wider).encode()}, "do not fit"),
         ({"flock.json": json.dumps(unknown).encode()}, "colour is not a parameter"),
+        ({"flock.json": json.dumps({**member, "format": 9}).encode()}, "format = 9"),
         ({"policy.pth": b"garbage"}, "damaged or not a policy"),
-        ({"policy.pth": None}, "do not fit"),
+        ({"policy.pth": None}, "not a policy of sb3_flock"),
     ):
         yield rewrite(saved, changes), words
 

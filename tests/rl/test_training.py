@@ -14,7 +14,7 @@ from sb3_flock.rl.algorithms import ALGORITHMS
 from sb3_flock.rl.config import TrainingConfig
 from sb3_flock.rl.config_io import load_config
 from sb3_flock.rl.saving import PolicyError
-from sb3_flock.settings import SettingsError
+from sb3_flock.settings import UserError
 
 TINY = {
     "total_timesteps": 300, "n_flocks": 2, "eval_freq": 120, "eval_episodes": 2, "save_freq": 150, "max_cycles": 20,
@@ -144,11 +144,14 @@ def test_a_zip_tells_its_task_and_versions_and_a_policy_flies_any_number(tmp_pat
 def test_a_training_can_start_from_trained_weights(tmp_path):
     first = train(tiny(tmp_path), quiet())
     second = train(tiny(tmp_path, init_from=str(first.folder), learning_starts=10**6, eval_freq=0), quiet())
-    loaded = load_policy(first.best_model).parameters["policy"]
+    loaded = load_policy(first.best_model).policy.state_dict()
     for name, value in second.model.policy.state_dict().items():
         assert th.equal(value, loaded[name])
-    with pytest.raises(PolicyError, match="init_from"):
-        train(tiny(tmp_path, init_from=str(first.folder), features_dim=32), quiet())
+    folders = sorted((tmp_path / "runs").iterdir())
+    for misfit in ({"features_dim": 32}, {"action_bound": "tanh"}, {"algo": "td3"}):
+        with pytest.raises(PolicyError, match="init_from"):
+            train(tiny(tmp_path, init_from=str(first.folder), **misfit), quiet())
+    assert sorted((tmp_path / "runs").iterdir()) == folders  # a refused training leaves nothing behind
 
 
 def test_an_interrupted_training_leaves_its_model(tmp_path):
@@ -171,12 +174,20 @@ def test_workers_train_too(tmp_path):
 
 @pytest.mark.parametrize(
     ("changes", "message"),
-    [({"device": "abacus"}, "device = 'abacus'"), ({"output_dir": "/dev/null/runs"}, "output_dir = /dev/null/runs")],
+    [
+        ({"device": "abacus"}, "device = 'abacus'"),
+        ({"device": "meta"}, "device = 'meta'"),
+        ({"output_dir": "/dev/null/runs"}, "output_dir = /dev/null/runs"),
+        ({"n_anchors": 5}, "do not fit a tensor of"),
+        ({"buffer_size": 10**12}, "buffer_size = 1000000000000"),
+        ({"n_vehicles": 500, "max_vehicles": 500}, "n_vehicles = 500"),
+    ],
 )
 def test_what_cannot_be_used_is_told_in_one_line(changes, message, tmp_path):
-    with pytest.raises(SettingsError, match=message) as error:
+    with pytest.raises(UserError, match=message) as error:
         train(tiny(tmp_path, **changes), quiet())
     assert "\n" not in str(error.value)
+    assert not (tmp_path / "runs").exists()
 
 
 def test_progress_is_plain_lines_in_a_pipe_and_a_panel_in_a_terminal(tmp_path):

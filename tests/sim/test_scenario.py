@@ -4,7 +4,7 @@ from sb3_flock.settings import SettingsError
 from sb3_flock.sim import RewardWeights, Scenario
 
 
-def test_the_defaults_are_the_papers_numbers():
+def test_the_defaults_are_the_papers_numbers_where_it_gives_them():
     scenario = Scenario()
     assert (scenario.time_step, scenario.max_speed, scenario.obstacle_max_speed, scenario.waypoint_speed) == (
         0.1,
@@ -52,6 +52,11 @@ def test_replace_validates_and_leaves_the_original():
 def test_scenarios_are_frozen():
     with pytest.raises(Exception, match="frozen"):
         Scenario().n_vehicles = 4
+
+
+def test_obstacles_share_the_arena_unless_told_otherwise():
+    assert Scenario(arena=3.0).obstacle_half_side == 3.0
+    assert Scenario(arena=3.0, obstacle_arena=1.5).obstacle_half_side == 1.5
 
 
 def test_channel_radii_default_to_the_sensing_radii():

@@ -1,0 +1,25 @@
+"""A short training that fails if learning is broken anywhere between the env and the weights."""
+
+import io
+
+from rich.console import Console
+
+from sb3_flock import evaluate, load_policy, make_vec_env, train
+from sb3_flock.rl.algorithms import build_model
+from sb3_flock.rl.config import TrainingConfig
+from sb3_flock.rl.config_io import load_config
+
+
+def test_two_vehicles_learn_to_go_to_the_waypoint(tmp_path):
+    overrides = {
+        "n_vehicles": 2, "n_obstacles": 0, "max_cycles": 60, "arena": 0.5, "waypoint_speed": 0.0, "total_timesteps": 8_000,
+        "learning_starts": 1_000, "n_flocks": 10, "update_ratio": 0.2, "eval_freq": 2_000, "eval_episodes": 50,
+        "features_dim": 64, "channels": [8, 16], "n_critics": 1, "learning_rate": 1e-3, "output_dir": str(tmp_path),
+    }  # fmt: skip
+    config = load_config(TrainingConfig, overrides=overrides)
+    result = train(config, Console(file=io.StringIO()))
+    untrained = build_model(config, make_vec_env(config.scenario, 1))
+    before = evaluate(untrained, config.scenario, episodes=50, seed=3)["tracking_error"].mean
+    after = evaluate(load_policy(result.folder), episodes=50, seed=3)["tracking_error"].mean
+    assert before > 0.3
+    assert after < before / 2
