@@ -12,9 +12,10 @@ from sb3_flock.rl.config_io import load_config
 
 def test_two_vehicles_learn_to_go_to_the_waypoint(tmp_path):
     overrides = {
-        "n_vehicles": 2, "n_obstacles": 0, "max_cycles": 60, "arena": 0.5, "waypoint_speed": 0.0, "total_timesteps": 8_000,
-        "learning_starts": 1_000, "n_flocks": 10, "update_ratio": 0.2, "eval_freq": 2_000, "eval_episodes": 50,
-        "features_dim": 64, "channels": [8, 16], "n_critics": 1, "learning_rate": 1e-3, "output_dir": str(tmp_path),
+        "n_vehicles": 2, "n_obstacles": 0, "max_cycles": 60, "arena": 0.5, "waypoint_speed": 0.0, "goal_radius": 0.8,
+        "scale": 0.1, "gamma": 0.9, "learning_rate": 1e-3, "learning_starts": 1_000, "update_ratio": 0.3, "n_flocks": 10,
+        "features_dim": 64, "channels": [8, 16], "n_critics": 1, "total_timesteps": 12_000, "eval_freq": 3_000,
+        "eval_episodes": 50, "output_dir": str(tmp_path),
     }  # fmt: skip
     config = load_config(TrainingConfig, overrides=overrides)
     result = train(config, Console(file=io.StringIO()))
