@@ -159,7 +159,10 @@ def test_the_command_is_installed_and_help_needs_no_torch():
 
 def test_ctrl_c_leaves_the_model_and_exits_130(tmp_path):
     words = ["train", "--total-timesteps", "10000000", "--output-dir", str(tmp_path), "--eval-freq", "0", *TINY]
-    process = subprocess.Popen([sys.executable, "-m", "sb3_flock.cli", *words], stderr=subprocess.PIPE, text=True)
+    # A background job inherits an ignored SIGINT, and so would its children: have the handler set as in a terminal.
+    code = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+    code += "from sb3_flock.cli import main; sys.exit(main(sys.argv[1:]))"
+    process = subprocess.Popen([sys.executable, "-c", code, *words], stderr=subprocess.PIPE, text=True)
     try:
         deadline = time.monotonic() + 120
         while not list(tmp_path.glob("ddpg_3v1o_1/progress.csv")) and time.monotonic() < deadline:
