@@ -17,8 +17,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 class FlockProgress(BaseCallback):
     """Live progress: time left, env steps/s, updates/s, return, tracking error, violation rates, the last evaluation.
 
-    The flock's figures are means over the last 10 000 transitions, with exploration noise. Without a terminal (a pipe, a
-    log file) a plain line is printed after every evaluation instead.
+    The flock's figures are means over the last 10 000 transitions of practice, with its exploration noise and separations.
+    Without a terminal (a pipe, a log file) a plain line is printed after every evaluation instead.
 
     :param console: where to print
     :param total_timesteps: transitions of the whole training
