@@ -20,6 +20,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.utils import get_device
 
 from sb3_flock.envs.flocking_v0 import action_space, observation_space
 from sb3_flock.rl.algorithms import ALGORITHMS, policy_kwargs
@@ -140,11 +141,12 @@ def load_policy(path: str | Path, device: str = "cpu") -> LoadedPolicy:
     """
     path = find_policy(path)
     check_device(device)
+    torch_device = get_device(device)
     try:
         with zipfile.ZipFile(path) as archive:
             member = json.loads(archive.read(MEMBER))
             with archive.open("policy.pth") as file:
-                weights = th.load(file, map_location=device, weights_only=True)
+                weights = th.load(file, map_location=torch_device, weights_only=True)
     except KeyError as error:
         raise PolicyError(f"{path}: not a policy of sb3_flock ({_first_line(error)})") from None
     except Exception as error:  # zipfile, json and torch raise many kinds for a damaged file; all mean the same here
@@ -159,7 +161,7 @@ def load_policy(path: str | Path, device: str = "cpu") -> LoadedPolicy:
         raise PolicyError(f"{path}: its networks do not fit what it says of itself ({_first_line(error)})") from None
     if not all(bool(th.isfinite(tensor).all()) for tensor in policy.state_dict().values()):
         raise PolicyError(f"{path}: its weights are not finite")
-    policy.to(device).set_training_mode(False)
+    policy.to(torch_device).set_training_mode(False)
     return LoadedPolicy(path, policy, config, member.get("versions", {}), member.get("num_timesteps", 0))
 
 

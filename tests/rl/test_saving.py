@@ -42,6 +42,7 @@ def test_what_is_saved_is_what_loads(model, saved):
     observations = np.random.default_rng(0).random((4, 3, 11, 11)).astype(np.float32)
     np.testing.assert_array_equal(policy.predict(observations)[0], model.predict(observations, deterministic=True)[0])
     assert [path.name for path in saved.parent.iterdir()] == ["policy.zip"]
+    assert load_policy(saved, device="auto").config == CONFIG
 
 
 def test_a_run_folder_means_its_best_model_else_its_final(saved, tmp_path):
