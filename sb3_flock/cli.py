@@ -146,6 +146,7 @@ def _train(options: argparse.Namespace, words: Sequence[str]) -> int:
 
     config = _config_of(options)
     console = Console(stderr=True)
+    # Imported only now: a mistake in the config is told without waiting for torch.
     from sb3_flock.rl.saving import load_policy
     from sb3_flock.rl.training import train
 
