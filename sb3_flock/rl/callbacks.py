@@ -59,7 +59,8 @@ class NeighborInclusiveReward(BaseCallback):
         self._returns = np.zeros(n_envs)
 
     def _on_step(self) -> bool:
-        rewards, infos, dones = self.locals["rewards"], self.locals["infos"], self.locals["dones"]
+        rewards, infos = self.locals["rewards"], self.locals["infos"]
+        dones = np.asarray(self.locals["dones"], dtype=bool)  # SuperSuit's own wrapper gives integers
         for info, reward in zip(infos, rewards, strict=True):
             info["reward"] = float(reward)
         rewards[:] = self.mix(rewards, infos)

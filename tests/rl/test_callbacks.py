@@ -1,6 +1,7 @@
 import gymnasium
 import numpy as np
 import pytest
+import supersuit
 from mpe2 import simple_spread_v3
 from stable_baselines3 import DDPG
 from stable_baselines3.common.callbacks import BaseCallback
@@ -118,6 +119,19 @@ def test_it_works_on_an_env_that_is_not_ours():
     assert mixed_somewhere
     # SuperSuit marks no time limit; the flattening does.
     assert model.replay_buffer.timeouts[7].all()
+
+
+def test_it_works_on_supersuits_own_wrapper_when_told_the_number_of_agents():
+    flat = supersuit.concat_vec_envs_v1(
+        supersuit.pettingzoo_env_to_vec_env_v1(spread_env()), 2, base_class="stable_baselines3"
+    )
+    record, callback = Record(), NeighborInclusiveReward(0.6, n_agents=3)
+    model = DDPG("MlpPolicy", flat, policy_kwargs={"net_arch": [8]}, learning_starts=10**9, buffer_size=500, device="cpu")
+    model.learn(20 * 6, callback=[callback, record])
+    for step, (_, infos, _) in enumerate(record.steps):
+        np.testing.assert_allclose(model.replay_buffer.rewards[step], expected_mix(infos, 3, 0.6), rtol=1e-5)
+    returns = [sum(rewards[slot] for rewards, _, _ in record.steps[:8]) for slot in range(6)]
+    np.testing.assert_allclose(list(callback._finished)[:6], returns, rtol=1e-5)
 
 
 def test_without_the_key_an_agent_keeps_its_reward():
