@@ -7,6 +7,7 @@ A field's ``description`` (with its unit and source) is the only documentation o
 from __future__ import annotations
 
 import difflib
+import numbers
 from collections.abc import Iterable, Mapping
 from typing import Any, TypeVar
 
@@ -43,6 +44,15 @@ class Settings(BaseModel):
         :raises SettingsError: for an unknown name or a value that is not accepted
         """
         return type(self)(**{**{name: getattr(self, name) for name in type(self).model_fields}, **changes})
+
+
+def check_integer(name: str, value: Any, least: int) -> None:
+    """Whether an argument is an integer of at least ``least``.
+
+    :raises SettingsError: if not
+    """
+    if not isinstance(value, numbers.Integral) or value < least:
+        raise SettingsError(f"{name} = {value!r}: input should be an integer of at least {least}")
 
 
 def leaf_paths(settings: type[Settings], prefix: tuple[str, ...] = ()) -> Iterable[tuple[str, ...]]:

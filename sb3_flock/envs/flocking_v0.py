@@ -173,8 +173,8 @@ class parallel_env(ParallelEnv[str, Observation, Action]):  # noqa: N801 - Petti
 
     def _infos(self, sensing: Sensing, terms: dict[str, NDArray[np.float64]], truncated: bool) -> dict[str, dict[str, Any]]:
         scenario = self.scenario
-        nearest_neighbor = sensing.neighbor_distances[0].min(-1, initial=np.inf)
-        nearest_obstacle = sensing.obstacle_distances[0].min(-1, initial=np.inf)
+        nearest_neighbor = sensing.nearest_neighbor[0]
+        nearest_obstacle = sensing.nearest_obstacle[0]
         connected = bool(is_connected(sensing.neighbors)[0])
         infos: dict[str, dict[str, Any]] = {}
         for i, agent in enumerate(self.agents):

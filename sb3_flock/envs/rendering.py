@@ -86,8 +86,8 @@ class Renderer:
 
         sensing = sense(world)
         positions = world.positions[0]
-        too_close = sensing.neighbor_distances[0].min(-1, initial=np.inf) < scenario.neighbor_separation
-        hit = sensing.obstacle_distances[0].min(-1, initial=np.inf) < scenario.obstacle_separation
+        too_close = sensing.nearest_neighbor[0] < scenario.neighbor_separation
+        hit = sensing.nearest_obstacle[0] < scenario.obstacle_separation
         for i, j in np.argwhere(np.triu(sensing.neighbors[0])):
             pygame.draw.aaline(canvas, _LINK, self._pixels(positions[i]), self._pixels(positions[j]))
         for obstacle in world.obstacle_positions[0]:

@@ -21,7 +21,7 @@ from supersuit.vector.multiproc_vec import ProcConcatVec, numpy_deepcopy
 from supersuit.vector.sb3_vector_wrapper import SB3VecEnvWrapper
 
 from sb3_flock.envs import flocking_v0
-from sb3_flock.settings import SettingsError
+from sb3_flock.settings import check_integer
 from sb3_flock.sim import Scenario
 
 
@@ -41,7 +41,7 @@ def make_vec_env(
     :param render_mode: as in :class:`~sb3_flock.envs.flocking_v0.parallel_env`; the first flock is drawn
     :raises SettingsError: for a count that is not accepted
     """
-    _check_integer("n_flocks", n_flocks, least=1)
+    check_integer("n_flocks", n_flocks, least=1)
     return flatten(flocking_v0.parallel_env(scenario, render_mode=render_mode), n_flocks, num_cpus, seed)
 
 
@@ -54,18 +54,13 @@ def flatten(env: ParallelEnv, n_copies: int = 1, num_cpus: int = 0, seed: int | 
     :param seed: seeds all copies, each with a stream of its own
     :raises SettingsError: for a count that is not accepted
     """
-    _check_integer("n_copies", n_copies, least=1)
-    _check_integer("num_cpus", num_cpus, least=0)
+    check_integer("n_copies", n_copies, least=1)
+    check_integer("num_cpus", num_cpus, least=0)
     flat = supersuit.pettingzoo_env_to_vec_env_v1(env)
     vec_env = supersuit.concat_vec_envs_v1(flat, n_copies, num_cpus=num_cpus, base_class="gymnasium")
     adapter = ParameterSharingVecEnv(vec_env, env)
     adapter.seed(seed)
     return adapter
-
-
-def _check_integer(name: str, value: int, least: int) -> None:
-    if not isinstance(value, (int, np.integer)) or value < least:
-        raise SettingsError(f"{name} = {value!r}: input should be an integer of at least {least}")
 
 
 class ParameterSharingVecEnv(SB3VecEnvWrapper):
@@ -99,7 +94,7 @@ class ParameterSharingVecEnv(SB3VecEnvWrapper):
         :raises SettingsError: for a negative seed
         """
         if seed is not None:
-            _check_integer("seed", seed, least=0)
+            check_integer("seed", seed, least=0)
         self._seed = seed
         return [seed] * self.num_envs
 
@@ -117,18 +112,15 @@ class ParameterSharingVecEnv(SB3VecEnvWrapper):
             first = int(np.random.SeedSequence(self._seed).generate_state(1)[0]) // 2
         self._seed, self._unseeded = None, False
         options, self._options = (self._options if options is None else options), None
-        if self._has_workers:
-            with self._guarded():
-                observations, infos = self._reset_workers(first, options)
-        else:
-            observations, infos = self.venv.reset(seed=first, options=options)
-        self.reset_infos = infos
+        reset = self._reset_workers if self._has_workers else self.venv.reset
+        with self._guarded():
+            observations, self.reset_infos = reset(seed=first, options=options)
         return observations
 
-    def _reset_workers(self, first: int | None, options: dict[str, Any] | None) -> tuple[Any, list[dict[str, Any]]]:
+    def _reset_workers(self, seed: int | None, options: dict[str, Any] | None) -> tuple[Any, list[dict[str, Any]]]:
         """Seed the workers' copies as if they were in this process; SuperSuit would let their seeds overlap."""
         for pipe, start in zip(self.venv.pipes, self.venv.idx_starts, strict=False):
-            pipe.send(("reset", (None if first is None else first + start // self.n_agents, options)))
+            pipe.send(("reset", (None if seed is None else seed + start // self.n_agents, options)))
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for start, compressed in zip(self.venv.idx_starts, self.venv._receive_info(), strict=False):
             for slot, info in compressed:
@@ -158,6 +150,8 @@ class ParameterSharingVecEnv(SB3VecEnvWrapper):
         try:
             yield
         except (EOFError, OSError) as error:
+            if not self._has_workers:
+                raise  # the env's own
             dead = [f"{proc.pid} (exit code {proc.exitcode})" for proc in self.venv.procs if not proc.is_alive()]
             self.close()
             who = ", ".join(dead) or "unknown"

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_flock.evaluation.metrics import EpisodeMetrics, Metric, summarize
-from sb3_flock.settings import SettingsError
+from sb3_flock.settings import SettingsError, check_integer
 from sb3_flock.sim import Scenario, Sensing, World, episode_rng, observe, own_reward, reward_terms
 
 BATCH = 250
@@ -59,8 +59,7 @@ def fly(
     :raises SettingsError: for counts that are not accepted
     """
     for name, value, least in (("episodes", episodes, 1), ("seed", seed, 0), ("batch", batch, 1)):
-        if value < least:
-            raise SettingsError(f"{name} = {value}: input should be at least {least}")
+        check_integer(name, value, least)
     results = []
     for start in range(0, episodes, batch):
         numbers = range(start, min(start + batch, episodes))

@@ -64,8 +64,8 @@ class EpisodeMetrics:
         scenario, sums = self.scenario, self._sums
         self.steps += 1
         distances = sensing.waypoint_distances
-        nearest_neighbor = sensing.neighbor_distances.min(-1, initial=np.inf)
-        nearest_obstacle = sensing.obstacle_distances.min(-1, initial=np.inf)
+        nearest_neighbor = sensing.nearest_neighbor
+        nearest_obstacle = sensing.nearest_obstacle
         np.minimum(self._min_neighbors, nearest_neighbor.min(-1), out=self._min_neighbors)
         np.minimum(self._min_obstacles, nearest_obstacle.min(-1), out=self._min_obstacles)
         sums["distance"] += distances.sum(-1)

@@ -37,6 +37,16 @@ class Sensing:
     waypoint_distances: NDArray[np.float64]
     """``(flocks, vehicles)``."""
 
+    @property
+    def nearest_neighbor(self) -> NDArray[np.float64]:
+        """Distance of each vehicle to the nearest other one, in range or not; ``(flocks, vehicles)``, inf if alone."""
+        return self.neighbor_distances.min(-1, initial=np.inf)
+
+    @property
+    def nearest_obstacle(self) -> NDArray[np.float64]:
+        """Distance of each vehicle to the nearest obstacle; ``(flocks, vehicles)``, inf where there is none."""
+        return self.obstacle_distances.min(-1, initial=np.inf)
+
 
 def sense(world: World) -> Sensing:
     """Everything the vehicles of every flock sense in the world's present state (section III-A)."""

@@ -238,6 +238,20 @@ def test_a_killed_worker_is_one_clear_error_and_the_rest_is_closed():
         assert not proc.is_alive()
 
 
+class HasNoDisk(flocking_v0.parallel_env):
+    """Fails with an error that a dead worker's pipe would raise, too."""
+
+    def step(self, actions):
+        raise OSError("no disk")
+
+
+def test_an_envs_own_error_is_not_taken_for_a_dead_worker():
+    env = flatten(HasNoDisk(SCENARIO), seed=0)
+    env.reset()
+    with pytest.raises(OSError, match="no disk"):
+        env.step(np.zeros((3, 2), dtype=np.float32))
+
+
 class SaysGoodbye(flocking_v0.parallel_env):
     """Leaves a file named for its process when it is closed."""
 
