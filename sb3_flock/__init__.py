@@ -18,14 +18,18 @@ if TYPE_CHECKING:
     from sb3_flock.evaluation import evaluate
     from sb3_flock.rl.callbacks import NeighborInclusiveReward
     from sb3_flock.rl.config import TrainingConfig
+    from sb3_flock.rl.ddpg import FlockDDPG
     from sb3_flock.rl.extractor import FlockCNN
     from sb3_flock.rl.policy import FlockPolicy, FlockSACPolicy
+    from sb3_flock.rl.replay import CompactReplayBuffer
     from sb3_flock.rl.saving import load_policy, save_model
     from sb3_flock.rl.training import train
     from sb3_flock.sim import RewardWeights, Scenario, World
 
 __all__ = [
+    "CompactReplayBuffer",
     "FlockCNN",
+    "FlockDDPG",
     "FlockPolicy",
     "FlockSACPolicy",
     "NeighborInclusiveReward",
@@ -43,7 +47,9 @@ __all__ = [
 ]
 
 _HOMES = {
+    "CompactReplayBuffer": "rl.replay",
     "FlockCNN": "rl.extractor",
+    "FlockDDPG": "rl.ddpg",
     "FlockPolicy": "rl.policy",
     "FlockSACPolicy": "rl.policy",
     "NeighborInclusiveReward": "rl.callbacks",

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3 import DDPG, SAC, TD3
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise, NormalActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
@@ -13,14 +14,17 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_flock.rl.config import TrainingConfig
+from sb3_flock.rl.ddpg import FlockDDPG
 from sb3_flock.rl.policy import FlockPolicy, FlockSACPolicy
+from sb3_flock.rl.replay import CompactReplayBuffer
 
 ALGORITHMS: dict[str, tuple[type[OffPolicyAlgorithm], type[BasePolicy]]] = {
-    "ddpg": (DDPG, FlockPolicy),
+    "ddpg": (FlockDDPG, FlockPolicy),
+    "ddpg-stock": (DDPG, FlockPolicy),
     "td3": (TD3, FlockPolicy),
     "sac": (SAC, FlockSACPolicy),
 }
-"""SB3's algorithm and our policy class by the name of ``TrainingConfig.algo``."""
+"""The algorithm and our policy class by the name of ``TrainingConfig.algo``."""
 
 
 def policy_kwargs(config: TrainingConfig) -> dict[str, Any]:
@@ -61,11 +65,17 @@ def build_model(config: TrainingConfig, env: VecEnv) -> OffPolicyAlgorithm:
         train_freq=learner.train_freq,
         gradient_steps=gradient_steps,
         n_steps=learner.n_steps,
+        replay_buffer_class=_replay_buffer_class(config),
         action_noise=_noise(config),
         policy_kwargs=policy_kwargs(config),
         seed=config.seed,
         device=config.device,
     )
+
+
+def _replay_buffer_class(config: TrainingConfig) -> type[ReplayBuffer] | None:
+    """Ours, or SB3's own choice for the stock algorithm and for returns over several steps, which ours does not know."""
+    return None if config.algo == "ddpg-stock" or config.learner.n_steps > 1 else CompactReplayBuffer
 
 
 def _noise(config: TrainingConfig) -> ActionNoise | None:

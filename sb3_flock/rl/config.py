@@ -81,7 +81,9 @@ class TrainingConfig(Settings):
 
     scenario: Scenario = Field(default_factory=Scenario, description="the task, as it is evaluated")
     practice: PracticeConfig = Field(default_factory=PracticeConfig, description="how training differs from the task")
-    algo: Literal["ddpg", "td3", "sac"] = Field("ddpg", description="learning algorithm (paper: ddpg)")
+    algo: Literal["ddpg", "ddpg-stock", "td3", "sac"] = Field(
+        "ddpg", description="learning algorithm (paper: ddpg); ddpg-stock: the same mathematics in SB3's own code, slower"
+    )
     learner: LearnerConfig = Field(default_factory=LearnerConfig, description="the learner")
     network: NetworkConfig = Field(default_factory=NetworkConfig, description="the networks")
 

@@ -29,8 +29,8 @@ from sb3_flock.settings import SettingsError, UserError
 from sb3_flock.sim import Scenario
 
 MEMBER = "flock.json"
-FORMAT = 1
-"""Version of the member's layout."""
+FORMAT = 2
+"""Version of the member's layout and of the networks' (2: the features are flattened anchor by anchor)."""
 PACKAGES = ("sb3_flock", "stable_baselines3", "torch", "gymnasium", "pettingzoo", "supersuit", "numpy")
 
 

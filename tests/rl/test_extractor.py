@@ -23,7 +23,23 @@ def test_features_have_the_stated_shape(side, kwargs):
 def test_two_convolutions_and_one_dense_layer_each_behind_a_relu():
     extractor = FlockCNN(space())
     kinds = [type(module).__name__ for module in extractor.modules() if not list(module.children())]
-    assert kinds == ["Conv2d", "ReLU", "Conv2d", "ReLU", "Flatten", "Linear", "ReLU"]
+    assert kinds == ["Conv2d", "ReLU", "Conv2d", "ReLU", "_FlattenByAnchor", "Linear", "ReLU"]
+
+
+@pytest.mark.parametrize(
+    ("side", "kwargs"),
+    [(11, {}), (7, {"stride": 1}), (12, {"channels": (4, 6, 5), "kernel_size": 2}), (9, {"channels": (4,)})],
+)
+def test_it_computes_what_torchs_own_layers_do_forward_and_backward(side, kwargs):
+    extractor = FlockCNN(space(side), features_dim=24, layer_norm=True, **kwargs)
+    observations = th.randn(5, 3, side, side, requires_grad=True)
+    ours, torchs = extractor(observations), extractor.dense(extractor.cnn(observations))
+    th.testing.assert_close(ours, torchs)
+    th.testing.assert_close(extractor(extractor.patches(observations)), ours)
+    leaves, weights = [observations, *extractor.parameters()], th.randn(5, 24)
+    for one, other in zip(th.autograd.grad(ours, leaves, weights), th.autograd.grad(torchs, leaves, weights), strict=True):
+        th.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
+        assert one.stride() == other.contiguous().stride()
 
 
 def test_every_anchor_matters():
