@@ -45,7 +45,7 @@ from pettingzoo.utils.conversions import parallel_to_aec
 from sb3_flock.settings import SettingsError
 from sb3_flock.sim import Scenario, Sensing, World, observe, own_reward, reward_terms, sense
 from sb3_flock.sim.scenario import MAX_BODIES
-from sb3_flock.sim.sensing import is_connected
+from sb3_flock.sim.sensing import is_connected, nearest
 
 Observation = NDArray[np.float32]
 Action = NDArray[np.float32]
@@ -173,13 +173,15 @@ class parallel_env(ParallelEnv[str, Observation, Action]):  # noqa: N801 - Petti
 
     def _infos(self, sensing: Sensing, terms: dict[str, NDArray[np.float64]], truncated: bool) -> dict[str, dict[str, Any]]:
         scenario = self.scenario
-        nearest_neighbor = sensing.nearest_neighbor[0]
-        nearest_obstacle = sensing.nearest_obstacle[0]
+        positions = self.world.positions
+        nearest_neighbor = nearest(positions, positions, others=True)[0]
+        nearest_obstacle = nearest(positions, self.world.obstacle_positions)[0]
+        neighbors = sensing.neighbors.by_observer()
         connected = bool(is_connected(sensing.neighbors)[0])
         infos: dict[str, dict[str, Any]] = {}
         for i, agent in enumerate(self.agents):
             infos[agent] = {
-                "neighbors": np.flatnonzero(sensing.neighbors[0, i]),
+                "neighbors": neighbors[i],
                 "reward_terms": {name: float(term[i]) for name, term in terms.items()},
                 "metrics": {
                     "tracking_error": float(sensing.waypoint_distances[0, i]),

@@ -86,9 +86,9 @@ class Renderer:
 
         sensing = sense(world)
         positions = world.positions[0]
-        too_close = sensing.nearest_neighbor[0] < scenario.neighbor_separation
-        hit = sensing.nearest_obstacle[0] < scenario.obstacle_separation
-        for i, j in np.argwhere(np.triu(sensing.neighbors[0])):
+        too_close = sensing.neighbors.count(scenario.neighbor_separation)[0] > 0
+        hit = sensing.obstacles.count(scenario.obstacle_separation)[0] > 0
+        for i, j in zip(sensing.neighbors.observers, sensing.neighbors.bodies, strict=True):
             pygame.draw.aaline(canvas, _LINK, self._pixels(positions[i]), self._pixels(positions[j]))
         for obstacle in world.obstacle_positions[0]:
             pygame.draw.circle(canvas, _OBSTACLE, self._pixels(obstacle), 5)

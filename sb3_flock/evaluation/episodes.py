@@ -68,7 +68,7 @@ def fly(
         sensing = world.reset([episode_rng(seed, episode) for episode in numbers])
         for _ in range(scenario.max_cycles):
             sensing, clipped = world.step(controller.act(sensing, scenario))
-            metrics.update(sensing, own_reward(reward_terms(sensing, clipped, scenario)))
+            metrics.update(world, sensing, own_reward(reward_terms(sensing, clipped, scenario)))
         results.append(metrics.result())
     return {name: np.concatenate([result[name] for result in results]) for name in results[0]}
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_flock.sim import Scenario, Sensing
-from sb3_flock.sim.sensing import is_connected
+from sb3_flock.sim import Scenario, Sensing, World
+from sb3_flock.sim.sensing import distance_blocks, is_connected, nearest
 
 METRICS = {
     "tracking_error": "mean distance vehicle to waypoint over vehicles and settled steps [m]",
@@ -59,30 +59,29 @@ class EpisodeMetrics:
         self._min_obstacles = np.full(n_flocks, np.inf)
         self._arrived = np.zeros(n_flocks, dtype=bool)
 
-    def update(self, sensing: Sensing, rewards: NDArray[np.float64]) -> None:
-        """Take in the state after one step and its rewards ``(flocks, vehicles)``."""
-        scenario, sums = self.scenario, self._sums
+    def update(self, world: World, sensing: Sensing, rewards: NDArray[np.float64]) -> None:
+        """Take in the state after one step, what was sensed there and its rewards ``(flocks, vehicles)``."""
+        scenario, sums, positions = self.scenario, self._sums, world.positions
         self.steps += 1
+        settled = 2 * self.steps > scenario.max_cycles
         distances = sensing.waypoint_distances
-        nearest_neighbor = sensing.nearest_neighbor
-        nearest_obstacle = sensing.nearest_obstacle
-        np.minimum(self._min_neighbors, nearest_neighbor.min(-1), out=self._min_neighbors)
-        np.minimum(self._min_obstacles, nearest_obstacle.min(-1), out=self._min_obstacles)
+        for _, to_neighbors in distance_blocks(positions, positions, others=True):
+            by_flock = to_neighbors.reshape(len(positions), -1)
+            np.minimum(self._min_neighbors, by_flock.min(-1), out=self._min_neighbors)
+            if settled:  # each pair is seen from both sides
+                sums["pair"] += np.where(np.isfinite(by_flock), by_flock, 0.0).sum(-1) / 2
+        to_obstacle = nearest(positions, world.obstacle_positions).min(-1)
+        np.minimum(self._min_obstacles, to_obstacle, out=self._min_obstacles)
         sums["distance"] += distances.sum(-1)
-        sums["neighbor_hits"] += (nearest_neighbor < scenario.neighbor_separation).sum(-1)
-        sums["obstacle_hits"] += (nearest_obstacle < scenario.obstacle_separation).sum(-1)
+        sums["neighbor_hits"] += (sensing.neighbors.count(scenario.neighbor_separation) > 0).sum(-1)
+        sums["obstacle_hits"] += (sensing.obstacles.count(scenario.obstacle_separation) > 0).sum(-1)
         sums["return"] += rewards.sum(-1)
-        if 2 * self.steps <= scenario.max_cycles:
+        if not settled:
             return
         self.settled_steps += 1
         sums["settled_distance"] += distances.sum(-1)
-        first, second = np.triu_indices(scenario.n_vehicles, k=1)
-        # Contiguous, so that NumPy adds the pairs up in the same order however many flocks there are.
-        pairs = np.ascontiguousarray(sensing.neighbor_distances[:, first, second])
-        linked = sensing.neighbors[:, first, second]
-        sums["pair"] += pairs.sum(-1)
-        sums["linked"] += np.where(linked, pairs, 0.0).sum(-1)
-        sums["n_linked"] += linked.sum(-1)
+        sums["linked"] += sensing.neighbors.sum(sensing.neighbors.distances).sum(-1) / 2
+        sums["n_linked"] += sensing.neighbors.count().sum(-1) / 2
         connected = is_connected(sensing.neighbors)
         sums["connected"] += connected
         self._arrived = connected & (distances < scenario.link_range).all(-1)

@@ -73,12 +73,11 @@ class NeighborInclusiveReward(BaseCallback):
 
     def mix(self, rewards: np.ndarray, infos: list[dict[str, Any]]) -> np.ndarray:
         """The mixed reward of every slot of the vector env, ``(slots,)``."""
-        n_agents = self._agents_per_copy
-        neighbors = np.zeros((len(infos), n_agents), dtype=bool)
-        for slot, info in enumerate(infos):
-            neighbors[slot, info.get("neighbors", ())] = True
-        by_copy = (-1, n_agents)
-        return mix_rewards(rewards.reshape(by_copy), neighbors.reshape(*by_copy, n_agents), self.lambda_).ravel()
+        neighbors = [np.asarray(info.get("neighbors", ()), dtype=np.int64) for info in infos]
+        slots = np.arange(len(infos))
+        observers = np.repeat(slots, [len(found) for found in neighbors])
+        first = observers - observers % self._agents_per_copy  # slot of the copy's first agent
+        return mix_rewards(rewards, observers, first + np.concatenate(neighbors), self.lambda_)
 
 
 class FlockMetrics(BaseCallback):

@@ -34,18 +34,18 @@ class FlockDDPG(DDPG):
         """Update the networks from the replay buffer (Algorithm 1 of the paper; one target network each)."""
         self.policy.set_training_mode(True)
         self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
-        patches = self.critic.features_extractor.patches
+        extractor: FlockCNN = self.critic.features_extractor  # type: ignore[assignment]
         actor, critic = list(self.actor.parameters()), list(self.critic.parameters())
         targets = list(self.actor_target.parameters()) + list(self.critic_target.parameters())
-        follow = get_ema_multi_avg_fn(1.0 - self.tau)
+        follow = get_ema_multi_avg_fn(1.0 - self.tau)  # type: ignore[no-untyped-call]
         actor_losses, critic_losses = [], []
         for _ in range(gradient_steps):
             self._n_updates += 1
             batch = self.replay_buffer.sample(batch_size)  # type: ignore[union-attr]
             discounts = self.gamma if batch.discounts is None else batch.discounts
-            observations = patches(batch.observations)
+            observations = extractor.patches(batch.observations)
             with th.no_grad():
-                next_observations = patches(batch.next_observations)
+                next_observations = extractor.patches(batch.next_observations)
                 next_actions = self.actor_target(next_observations)
                 next_values = th.cat(self.critic_target(next_observations, next_actions), dim=1).amin(1, keepdim=True)
                 target_values = batch.rewards + (1 - batch.dones) * discounts * next_values

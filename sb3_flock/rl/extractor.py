@@ -98,7 +98,8 @@ class _Convolutions(th.autograd.Function):
     def forward(ctx: Any, patches: th.Tensor, taps: list[th.Tensor], *weights: th.Tensor) -> th.Tensor:
         kernels = [kernel.permute(0, 2, 3, 1).flatten(1) for kernel in weights[::2]]
         batch = len(patches)
-        inputs, outputs = [], []
+        inputs: list[th.Tensor] = []
+        outputs: list[th.Tensor] = []
         for layer, (kernel, bias) in enumerate(zip(kernels, weights[1::2], strict=True)):
             if layer:
                 patches = outputs[-1].view(batch, -1, kernels[layer - 1].shape[0]).index_select(1, taps[layer - 1])
@@ -109,7 +110,7 @@ class _Convolutions(th.autograd.Function):
         return outputs[-1].view(batch, -1)
 
     @staticmethod
-    def backward(ctx: Any, gradient: th.Tensor) -> tuple[th.Tensor | None, ...]:  # type: ignore[override]
+    def backward(ctx: Any, gradient: th.Tensor) -> tuple[th.Tensor | None, ...]:
         batch, n = len(gradient), len(ctx.shapes)
         saved = ctx.saved_tensors
         inputs, outputs, kernels, taps = saved[:n], saved[n : 2 * n], saved[2 * n : 3 * n], saved[3 * n :]

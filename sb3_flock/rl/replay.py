@@ -28,8 +28,8 @@ class CompactReplayBuffer(ReplayBuffer):
     def __init__(
         self,
         buffer_size: int,
-        observation_space: spaces.Space,
-        action_space: spaces.Space,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
         device: th.device | str = "auto",
         n_envs: int = 1,
         optimize_memory_usage: bool = False,
@@ -62,7 +62,9 @@ class CompactReplayBuffer(ReplayBuffer):
         """Store one vector step."""
         self._last_observations.pop(self.pos, None)
         if done.any():
-            self._last_observations[self.pos] = {env: next_obs[env].astype(np.float16) for env in np.flatnonzero(done)}
+            self._last_observations[self.pos] = {
+                env: next_obs[env].astype(np.float16) for env in np.flatnonzero(done).tolist()
+            }
         super().add(obs, next_obs, action, reward, done, infos)
 
     def _get_samples(self, batch_inds: NDArray[np.int64], env: VecNormalize | None = None) -> ReplayBufferSamples:

@@ -45,12 +45,11 @@ def reward_terms(sensing: Sensing, actions: NDArray[np.float64], scenario: Scena
     :return: ``connectivity``, ``obstacle``, ``waypoint`` and ``control``, each ``(flocks, vehicles)``
     """
     weights = scenario.reward
-    too_close = sensing.neighbor_distances < scenario.neighbor_separation
-    linked = sensing.neighbors & ~too_close
-    hit = sensing.obstacle_distances < scenario.obstacle_separation
+    too_close = sensing.neighbors.count(scenario.neighbor_separation)
+    linked = sensing.neighbors.count() - too_close
     terms = {
-        "connectivity": weights.link_bonus * linked.sum(-1) - weights.separation_penalty * too_close.sum(-1),
-        "obstacle": -weights.obstacle_penalty * hit.sum(-1),
+        "connectivity": weights.link_bonus * linked - weights.separation_penalty * too_close,
+        "obstacle": -weights.obstacle_penalty * sensing.obstacles.count(scenario.obstacle_separation),
         "waypoint": -weights.epsilon * sensing.waypoint_distances,
         "control": weights.beta * np.square(actions).sum(-1),
     }
@@ -62,17 +61,20 @@ def own_reward(terms: dict[str, NDArray[np.float64]]) -> NDArray[np.float64]:
     return np.add.reduce(list(terms.values()))
 
 
-def mix_rewards(rewards: NDArray[np.floating], neighbors: NDArray[np.bool_], lambda_: float) -> NDArray[np.float64]:
+def mix_rewards(
+    rewards: NDArray[np.floating], observers: NDArray[np.int64], neighbors: NDArray[np.int64], lambda_: float
+) -> NDArray[np.float64]:
     """The neighbor-inclusive reward r_{i} = lambda r_i + (1 - lambda) mean of the neighbors' r_j (section IV-B).
 
     A vehicle without neighbors keeps its own r_i, unscaled: scaling it would pay (or fine) it for being alone.
 
-    :param rewards: ``(..., vehicles)``
-    :param neighbors: ``(..., vehicles, vehicles)``, true where j is a neighbor of i
+    :param rewards: r of all vehicles, of any shape
+    :param observers: ``(links,)``, number i of a vehicle in ``rewards``, flattened
+    :param neighbors: ``(links,)``, number j of one of its neighbors
     :param lambda_: share of the own reward, in [0, 1]
-    :return: ``(..., vehicles)``
+    :return: the shape of ``rewards``
     """
-    own = np.asarray(rewards, dtype=np.float64)
-    count = neighbors.sum(-1)
-    others = np.where(neighbors, own[..., None, :], 0.0).sum(-1) / np.maximum(count, 1)
-    return np.where(count > 0, lambda_ * own + (1 - lambda_) * others, own)
+    own = np.asarray(rewards, dtype=np.float64).ravel()
+    count = np.bincount(observers, minlength=len(own))
+    others = np.bincount(observers, own[neighbors], minlength=len(own)) / np.maximum(count, 1)
+    return np.where(count > 0, lambda_ * own + (1 - lambda_) * others, own).reshape(np.shape(rewards))

@@ -55,7 +55,7 @@ class Scenario(Settings):
         0.4, gt=0, description="half width r_g of the goal channel [m]; a farther waypoint shows on its circle (open)"
     )
     anchor_width: float = Field(
-        1.0, gt=0, description="standard deviation sigma of the anchors' Gaussian [anchor spacings] (open)"
+        1.0, ge=0.1, description="standard deviation sigma of the anchors' Gaussian [anchor spacings] (open)"
     )
 
     reward: RewardWeights = Field(default_factory=RewardWeights, description="weights of the reward (paper, IV-B)")

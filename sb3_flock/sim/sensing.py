@@ -2,96 +2,212 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+
+from sb3_flock.sim.backend import compiled
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sb3_flock.sim.world import World
 
+_FEW = 128
+"""Bodies up to which all pairs are compared; a cell list is faster beyond."""
+
+_BLOCK = 1_000_000
+"""Distances held at once where all pairs of bodies are asked for."""
+
+
+@dataclass(frozen=True)
+class Contacts:
+    """Who senses whom: a row a pair, in the order of the sensing vehicles, then of the sensed bodies.
+
+    Memory and time grow with the pairs in range, not with the square of the bodies.
+    """
+
+    shape: tuple[int, int]
+    """``(flocks, vehicles)``."""
+    observers: NDArray[np.int64]
+    """``(contacts,)``: the vehicle that senses; vehicle i of flock f has the number f * vehicles + i."""
+    bodies: NDArray[np.int64]
+    """``(contacts,)``: the number of the sensed body within the flock."""
+    positions: NDArray[np.float64]
+    """``(contacts, 2)`` [m], of the body in the observer's frame: forward is +x, left is +y."""
+    distances: NDArray[np.float64]
+    """``(contacts,)`` [m]."""
+
+    def count(self, closer_than: float = np.inf) -> NDArray[np.int64]:
+        """How many bodies each vehicle senses nearer than a distance [m] (strictly); ``(flocks, vehicles)``."""
+        counts: NDArray[np.int64] = np.bincount(self.observers[self.distances < closer_than], minlength=self._size)
+        return counts.reshape(self.shape)
+
+    def sum(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """A value a contact, ``(contacts,)``, added up by observer: ``(flocks, vehicles)``."""
+        return np.bincount(self.observers, values, minlength=self._size).astype(np.float64).reshape(self.shape)
+
+    def by_observer(self) -> list[NDArray[np.int64]]:
+        """The bodies that each vehicle senses, ascending; one array a vehicle."""
+        return np.split(self.bodies, np.cumsum(self.count().ravel())[:-1])
+
+    @property
+    def vehicles(self) -> NDArray[np.int64]:
+        """``bodies`` numbered like ``observers``, where they are vehicles."""
+        n = self.shape[1]
+        return self.observers // n * n + self.bodies
+
+    @property
+    def _size(self) -> int:
+        return self.shape[0] * self.shape[1]
+
 
 @dataclass(frozen=True)
 class Sensing:
-    """Positions relative to every vehicle, in its body frame: forward is +x, left is +y. Distances in meters.
+    """What every vehicle senses, in its own body frame: forward is +x, left is +y. Distances in meters."""
 
-    The distance of a vehicle to itself is infinite, so that no threshold counts it.
-    """
-
-    neighbor_positions: NDArray[np.float64]
-    """``(flocks, vehicles, vehicles, 2)``, of vehicle j seen from vehicle i."""
-    neighbor_distances: NDArray[np.float64]
-    """``(flocks, vehicles, vehicles)``."""
-    neighbors: NDArray[np.bool_]
-    """``(flocks, vehicles, vehicles)``, the proximity graph: d_ij < r_n."""
-    obstacle_positions: NDArray[np.float64]
-    """``(flocks, vehicles, obstacles, 2)``."""
-    obstacle_distances: NDArray[np.float64]
-    """``(flocks, vehicles, obstacles)``."""
-    detections: NDArray[np.bool_]
-    """``(flocks, vehicles, obstacles)``: d_io < r_o."""
+    neighbors: Contacts
+    """The proximity graph: d_ij < r_n."""
+    obstacles: Contacts
+    """Detected obstacles: d_io < r_o."""
     waypoint_positions: NDArray[np.float64]
     """``(flocks, vehicles, 2)``."""
     waypoint_distances: NDArray[np.float64]
     """``(flocks, vehicles)``."""
 
-    @property
-    def nearest_neighbor(self) -> NDArray[np.float64]:
-        """Distance of each vehicle to the nearest other one, in range or not; ``(flocks, vehicles)``, inf if alone."""
-        return self.neighbor_distances.min(-1, initial=np.inf)
-
-    @property
-    def nearest_obstacle(self) -> NDArray[np.float64]:
-        """Distance of each vehicle to the nearest obstacle; ``(flocks, vehicles)``, inf where there is none."""
-        return self.obstacle_distances.min(-1, initial=np.inf)
-
 
 def sense(world: World) -> Sensing:
     """Everything the vehicles of every flock sense in the world's present state (section III-A)."""
     scenario, positions = world.scenario, world.positions
-    neighbor_offsets = positions[:, None, :, :] - positions[:, :, None, :]
-    obstacle_offsets = world.obstacle_positions[:, None, :, :] - positions[:, :, None, :]
-    waypoint_offsets = world.waypoints[:, None, :] - positions
-
-    neighbor_distances = _norm(neighbor_offsets)
-    diagonal = np.arange(scenario.n_vehicles)
-    neighbor_distances[:, diagonal, diagonal] = np.inf
-    obstacle_distances = _norm(obstacle_offsets)
-
-    cos, sin = np.cos(world.headings), np.sin(world.headings)
+    frames = np.stack((np.cos(world.headings), np.sin(world.headings)), axis=-1)
+    offsets = world.waypoints[:, None, :] - positions
     return Sensing(
-        neighbor_positions=_to_body(neighbor_offsets, cos[..., None], sin[..., None]),
-        neighbor_distances=neighbor_distances,
-        neighbors=neighbor_distances < scenario.link_range,
-        obstacle_positions=_to_body(obstacle_offsets, cos[..., None], sin[..., None]),
-        obstacle_distances=obstacle_distances,
-        detections=obstacle_distances < scenario.detection_range,
-        waypoint_positions=_to_body(waypoint_offsets, cos, sin),
-        waypoint_distances=_norm(waypoint_offsets),
+        neighbors=find_contacts(positions, frames, positions, scenario.link_range, others=True),
+        obstacles=find_contacts(positions, frames, world.obstacle_positions, scenario.detection_range),
+        waypoint_positions=_to_body(offsets, frames),
+        waypoint_distances=_norm(offsets),
     )
+
+
+def find_contacts(
+    positions: NDArray[np.float64],
+    frames: NDArray[np.float64],
+    bodies: NDArray[np.float64],
+    reach: float,
+    others: bool = False,
+    compile_it: bool = True,
+) -> Contacts:
+    """The bodies strictly nearer than ``reach`` to each vehicle of the same flock.
+
+    :param positions: of the vehicles, ``(flocks, vehicles, 2)`` [m]
+    :param frames: cosine and sine of their headings, ``(flocks, vehicles, 2)``
+    :param bodies: positions of the bodies, ``(flocks, bodies, 2)`` [m]
+    :param reach: range [m]
+    :param others: whether the bodies are the vehicles, of which none senses itself
+    :param compile_it: use numba where it is installed; the numbers are the same
+    """
+    shape = positions.shape[:2]
+    kernels = compiled() if compile_it and bodies.shape[1] <= _FEW else None
+    if kernels is not None:
+        return Contacts(shape, *kernels.find_contacts(positions, frames, bodies, reach, others))
+    pairs = _all_pairs if bodies.shape[1] <= _FEW else _pairs_by_cell
+    observers, found, offsets, distances = pairs(positions, bodies, reach)
+    if others:
+        apart = observers % shape[1] != found
+        observers, found, offsets, distances = observers[apart], found[apart], offsets[apart], distances[apart]
+    return Contacts(shape, observers, found, _to_body(offsets, frames.reshape(-1, 2)[observers]), distances)
+
+
+Pairs = tuple["NDArray[np.int64]", "NDArray[np.int64]", "NDArray[np.float64]", "NDArray[np.float64]"]
+"""Observers, bodies, offsets in the world's frame and distances of the pairs in range."""
+
+
+def _all_pairs(positions: NDArray[np.float64], bodies: NDArray[np.float64], reach: float) -> Pairs:
+    offsets = bodies[:, None, :, :] - positions[:, :, None, :]
+    distances = _norm(offsets)
+    flocks, vehicles, found = np.nonzero(distances < reach)
+    return (
+        flocks * positions.shape[1] + vehicles,
+        found,
+        offsets[flocks, vehicles, found],
+        distances[flocks, vehicles, found],
+    )
+
+
+def _pairs_by_cell(positions: NDArray[np.float64], bodies: NDArray[np.float64], reach: float) -> Pairs:
+    """Square cells of side ``reach``, numbered flock by flock and column by column: a body in range of a vehicle lies in one
+    of three columns, in three cells of consecutive numbers each, so sorted bodies are found by bisection."""
+    n_flocks, n_bodies, _ = bodies.shape
+    corner = np.minimum(positions.min((0, 1)), bodies.min((0, 1), initial=np.inf))
+    span = np.maximum(positions.max((0, 1)), bodies.max((0, 1), initial=-np.inf)) - corner
+    columns, rows = (span // reach).astype(np.int64) + 3  # an empty one on either side
+
+    def cells(points: NDArray[np.float64]) -> NDArray[np.int64]:
+        column, row = np.moveaxis(((points - corner) // reach).astype(np.int64) + 1, -1, 0)
+        return ((np.arange(n_flocks)[:, None] * columns + column) * rows + row).ravel()
+
+    body_cells = cells(bodies)
+    order = np.argsort(body_cells, kind="stable")
+    middle = cells(positions)[:, None] + np.array([-rows, 0, rows])
+    first = np.searchsorted(body_cells[order], middle - 1, side="left").ravel()
+    counts = np.searchsorted(body_cells[order], middle + 1, side="right").ravel() - first
+    observers = np.repeat(np.arange(len(middle)), counts.reshape(-1, 3).sum(-1))
+    candidates = order[np.repeat(first - (np.cumsum(counts) - counts), counts) + np.arange(len(observers))]
+
+    offsets = bodies.reshape(-1, 2)[candidates] - positions.reshape(-1, 2)[observers]
+    distances = _norm(offsets)
+    near = np.flatnonzero(distances < reach)
+    near = near[np.lexsort((candidates[near], observers[near]))]
+    return observers[near], candidates[near] % n_bodies, offsets[near], distances[near]
+
+
+def distance_blocks(
+    positions: NDArray[np.float64], bodies: NDArray[np.float64], others: bool = False
+) -> Iterator[tuple[slice, NDArray[np.float64]]]:
+    """Distances between all vehicles and bodies of a flock, in range or not, some vehicles at a time to bound the memory.
+
+    :param others: whether the bodies are the vehicles; the distance to itself is infinite then
+    :return: a slice of the vehicles and ``(flocks, those vehicles, bodies)`` [m]
+    """
+    flocks, vehicles, _ = positions.shape
+    step = max(1, _BLOCK // max(1, flocks * bodies.shape[1]))
+    for start in range(0, vehicles, step):
+        rows = slice(start, min(start + step, vehicles))
+        distances = _norm(bodies[:, None, :, :] - positions[:, rows, None, :])
+        if others:
+            own = np.arange(rows.start, rows.stop)
+            distances[:, own - start, own] = np.inf
+        yield rows, distances
+
+
+def nearest(positions: NDArray[np.float64], bodies: NDArray[np.float64], others: bool = False) -> NDArray[np.float64]:
+    """Each vehicle's distance to the nearest body, in range or not: ``(flocks, vehicles)`` [m], inf where there is none."""
+    blocks = [distances.min(-1, initial=np.inf) for _, distances in distance_blocks(positions, bodies, others)]
+    return np.concatenate(blocks, axis=1)
+
+
+def is_connected(neighbors: Contacts) -> NDArray[np.bool_]:
+    """Whether each flock's proximity graph is connected, ``(flocks,)``; one vehicle alone is."""
+    flocks, vehicles = neighbors.shape
+    linked = neighbors.vehicles
+    # The smallest number that has reached each vehicle along its links; to look up that one's own is to jump ahead.
+    labels = np.arange(flocks * vehicles)
+    while True:
+        lower = labels.copy()
+        np.minimum.at(lower, neighbors.observers, labels[linked])
+        lower = lower[lower]
+        if np.array_equal(lower, labels):
+            return (labels.reshape(flocks, vehicles) == vehicles * np.arange(flocks)[:, None]).all(-1)
+        labels = lower
 
 
 def _norm(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.sqrt(np.square(vectors[..., 0]) + np.square(vectors[..., 1]))
 
 
-def _to_body(offsets: NDArray[np.float64], cos: NDArray[np.float64], sin: NDArray[np.float64]) -> NDArray[np.float64]:
+def _to_body(offsets: NDArray[np.float64], frames: NDArray[np.float64]) -> NDArray[np.float64]:
     """Rotate world offsets into the body frame: x_ij = R(theta_i) (x_j - x_i), R the rotation into the frame."""
-    x, y = offsets[..., 0], offsets[..., 1]
+    (x, y), (cos, sin) = np.moveaxis(offsets, -1, 0), np.moveaxis(frames, -1, 0)
     return np.stack((cos * x + sin * y, cos * y - sin * x), axis=-1)
-
-
-def is_connected(neighbors: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Whether each proximity graph is connected; one vehicle alone is.
-
-    :param neighbors: ``(..., vehicles, vehicles)``, symmetric
-    :return: ``(...,)``
-    """
-    reached = neighbors | np.eye(neighbors.shape[-1], dtype=bool)
-    length = 1  # `reached` holds the pairs joined by a path of at most this many links; squaring doubles it
-    while length < neighbors.shape[-1] - 1:
-        reached = np.matmul(reached, reached)
-        length *= 2
-    return np.asarray(reached[..., 0, :].all(-1))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+import math
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -120,21 +122,15 @@ class World:
 
     def _start(self, rng: Generator) -> tuple[NDArray[np.float64], ...]:
         scenario = self.scenario
+        placed = _Placed(scenario.neighbor_separation)
         positions = np.empty((scenario.n_vehicles, 2))
         for i in range(scenario.n_vehicles):
-            positions[i] = _draw_apart(
-                rng, scenario.arena, positions[:i], scenario.neighbor_separation, "n_vehicles", scenario.n_vehicles
-            )
+            positions[i] = placed.draw_apart(rng, scenario.arena, "n_vehicles", scenario.n_vehicles)
+            placed.add(*positions[i].tolist())
+        placed = _Placed(scenario.obstacle_separation, positions.tolist())
         obstacles = np.empty((scenario.n_obstacles, 2))
         for o in range(scenario.n_obstacles):
-            obstacles[o] = _draw_apart(
-                rng,
-                scenario.obstacle_half_side,
-                positions,
-                scenario.obstacle_separation,
-                "n_obstacles",
-                scenario.n_obstacles,
-            )
+            obstacles[o] = placed.draw_apart(rng, scenario.obstacle_half_side, "n_obstacles", scenario.n_obstacles)
         headings = rng.uniform(-np.pi, np.pi, scenario.n_vehicles)
         obstacle_headings = rng.uniform(-np.pi, np.pi, scenario.n_obstacles)
         waypoint = rng.uniform(-scenario.arena, scenario.arena, 2)
@@ -158,15 +154,42 @@ def wrap_angle(angles: NDArray[np.float64]) -> NDArray[np.float64]:
     return (angles + np.pi) % (2 * np.pi) - np.pi
 
 
-def _draw_apart(
-    rng: Generator, half_side: float, others: NDArray[np.float64], separation: float, name: str, count: int
-) -> NDArray[np.float64]:
-    """A point uniform in the square, drawn again while it is closer than ``separation`` to one of ``others``."""
-    for _ in range(_MAX_REDRAWS):
-        point = rng.uniform(-half_side, half_side, 2)
-        if not (np.square(others - point).sum(-1) < separation**2).any():
-            return point
-    raise WorldError(
-        f"{name} = {count}: no start at least {separation} m from the vehicles found in {_MAX_REDRAWS} draws "
-        f"from a square of half side {half_side} m; fewer bodies or a larger arena are needed"
-    )
+class _Placed:
+    """Vehicles placed so far, in square cells of the separation to keep from them: only nine cells need a look."""
+
+    def __init__(self, separation: float, points: Iterable[Sequence[float]] = ()) -> None:
+        self.separation = separation
+        self._cells: dict[tuple[int, int], list[tuple[float, float]]] = {}
+        for x, y in points:
+            self.add(x, y)
+
+    def add(self, x: float, y: float) -> None:
+        if self.separation == 0:  # nothing is ever too close
+            return
+        self._cells.setdefault(self._cell(x, y), []).append((x, y))
+
+    def draw_apart(self, rng: Generator, half_side: float, name: str, count: int) -> NDArray[np.float64]:
+        """A point uniform in the square, drawn again while it is closer than the separation to a vehicle."""
+        for _ in range(_MAX_REDRAWS):
+            point = rng.uniform(-half_side, half_side, 2)
+            if self._is_free(*point.tolist()):
+                return point
+        raise WorldError(
+            f"{name} = {count}: no start at least {self.separation} m from the vehicles found in {_MAX_REDRAWS} draws "
+            f"from a square of half side {half_side} m; fewer bodies or a larger arena are needed"
+        )
+
+    def _is_free(self, x: float, y: float) -> bool:
+        if not self._cells:
+            return True
+        column, row = self._cell(x, y)
+        near = self.separation**2
+        for cell in itertools.product((column - 1, column, column + 1), (row - 1, row, row + 1)):
+            for there_x, there_y in self._cells.get(cell, ()):
+                dx, dy = there_x - x, there_y - y
+                if dx * dx + dy * dy < near:
+                    return False
+        return True
+
+    def _cell(self, x: float, y: float) -> tuple[int, int]:
+        return math.floor(x / self.separation), math.floor(y / self.separation)

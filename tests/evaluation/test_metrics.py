@@ -14,7 +14,7 @@ def gather(steps, scenario=SCENARIO):
     metrics = EpisodeMetrics(scenario, 1)
     for positions, obstacles, waypoint, rewards in steps:
         world = place(scenario, positions, [0.0] * len(positions), obstacles, waypoint)
-        metrics.update(sense(world), np.array([rewards], dtype=float))
+        metrics.update(world, sense(world), np.array([rewards], dtype=float))
     return {name: value[0] for name, value in metrics.result().items()}
 
 

@@ -49,7 +49,7 @@ def test_fifty_updates_end_where_stock_ddpg_with_plain_convolutions_ends(n_criti
     start = [parameter.clone() for parameter in lean.policy.parameters()]
     for one in (lean, stock):
         one.learn(600)
-        np.random.seed(1)
+        np.random.seed(1)  # noqa: NPY002 - what SB3 draws from
         one.train(50, 64)
     assert lean._n_updates == stock._n_updates == 50
     for parameter, first in zip(lean.policy.parameters(), start, strict=True):

@@ -1,10 +1,12 @@
 import math
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sb3_flock.sim import Scenario, observe, sense
+from sb3_flock.sim.sensing import distance_blocks
 from tests.sim.conftest import place
 
 SCENARIO = Scenario(n_vehicles=4, n_obstacles=2)
@@ -60,8 +62,7 @@ def test_the_whole_tensor_against_the_sum_over_bodies(place):
             for b in range(11):
                 expected = sum(
                     math.exp(-0.5 * ((x - anchors[a]) ** 2 + (y - anchors[b]) ** 2) / 0.05**2)
-                    for (x, y), seen in zip(sensing.obstacle_positions[0, i], sensing.detections[0, i], strict=True)
-                    if seen
+                    for x, y in sensing.obstacles.positions[sensing.obstacles.observers == i]
                 )
                 np.testing.assert_allclose(tensor[i, 1, a, b], expected, rtol=1e-5, atol=1e-12)
 
@@ -81,7 +82,10 @@ def test_rotating_and_translating_the_world_changes_nothing(seed, angle, dx, dy)
     for name in ("positions", "obstacle_positions", "waypoints"):
         setattr(moved, name, getattr(world, name) @ rotation.T + (dx, dy))
     moved.headings = world.headings + angle
-    distances = np.concatenate([sense(world).neighbor_distances.ravel(), sense(world).obstacle_distances.ravel()])
+    bodies = ((world.positions, True), (world.obstacle_positions, False))
+    distances = np.concatenate(
+        [block.ravel() for there, others in bodies for _, block in distance_blocks(world.positions, there, others)]
+    )
     edge = np.abs(distances[:, None] - np.array([SCENARIO.link_range, SCENARIO.detection_range])).min() < 1e-9
     if not edge:  # rounding may carry a body over the edge of a sensing range
         np.testing.assert_allclose(observation(moved), observation(world), atol=1e-5)
@@ -111,8 +115,8 @@ def test_nothing_outside_its_sensing_range_shows(seed):
     world, near = random_world(seed), random_world(seed)
     sensing = sense(world)
     for i in range(4):
-        rest = [j for j in range(4) if j == i or sensing.neighbors[0, i, j]]
-        seen = sensing.detections[0, i]
+        rest = sorted([i, *sensing.neighbors.by_observer()[i]])
+        seen = sensing.obstacles.by_observer()[i]
         near = place(
             SCENARIO,
             world.positions[0, rest],
@@ -127,3 +131,15 @@ def test_nothing_outside_its_sensing_range_shows(seed):
 def test_every_call_returns_a_fresh_array():
     sensing = sense(random_world(0))
     assert not np.shares_memory(observe(sensing, SCENARIO), observe(sensing, SCENARIO))
+
+
+@settings(max_examples=50, deadline=None)
+@given(seeds, st.integers(2, 17), st.floats(0.1, 4.0), st.sampled_from([0.03, 0.15, 0.6]))
+def test_compiled_and_plain_paint_the_same(seed, n_anchors, anchor_width, radius):
+    pytest.importorskip("numba")
+    scenario = SCENARIO.replace(
+        n_anchors=n_anchors, anchor_width=anchor_width, neighbor_radius=radius, obstacle_radius=radius, goal_radius=radius
+    )
+    sensing = sense(random_world(seed, scenario))
+    compiled, plain = observe(sensing, scenario), observe(sensing, scenario, compile_it=False)
+    np.testing.assert_allclose(compiled, plain, rtol=1e-5, atol=1e-30)

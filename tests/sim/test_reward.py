@@ -51,30 +51,31 @@ def test_weights_and_scale_multiply_their_terms():
 
 
 def test_the_mix_by_hand():
-    neighbors = np.array([[0, 1, 1], [1, 0, 0], [1, 0, 0]], dtype=bool)
-    mixed = mix_rewards(np.array([1.0, 2.0, 4.0]), neighbors, 0.7)
+    observers, neighbors = np.array([(0, 1), (0, 2), (1, 0), (2, 0)]).T
+    mixed = mix_rewards(np.array([1.0, 2.0, 4.0]), observers, neighbors, 0.7)
     np.testing.assert_allclose(mixed, [0.7 * 1 + 0.3 * 3, 0.7 * 2 + 0.3 * 1, 0.7 * 4 + 0.3 * 1])
 
 
 def test_a_vehicle_without_neighbors_keeps_its_own_reward_unscaled():
-    mixed = mix_rewards(np.array([-2.0, 3.0]), np.zeros((2, 2), dtype=bool), 0.7)
-    np.testing.assert_array_equal(mixed, [-2.0, 3.0])
+    none = np.zeros(0, dtype=np.int64)
+    np.testing.assert_array_equal(mix_rewards(np.array([[-2.0, 3.0]]), none, none, 0.7), [[-2.0, 3.0]])
 
 
 @settings(max_examples=50, deadline=None)
 @given(st.integers(0, 2**31), st.floats(0, 1))
-def test_the_mix_stays_between_the_rewards_and_is_batched(seed, lambda_):
+def test_the_mix_is_the_mean_over_the_graph_and_stays_between_the_rewards(seed, lambda_):
     rng = np.random.default_rng(seed)
-    rewards, neighbors = rng.normal(size=(3, 5)), rng.random((3, 5, 5)) < 0.4
-    neighbors &= ~np.eye(5, dtype=bool)
-    mixed = mix_rewards(rewards, neighbors, lambda_)
+    rewards, linked = rng.normal(size=(3, 5)), rng.random((3, 5, 5)) < 0.4
+    flocks, i, j = np.nonzero(linked)
+    mixed = mix_rewards(rewards, 5 * flocks + i, 5 * flocks + j, lambda_)
     assert (mixed <= rewards.max(-1, keepdims=True) + 1e-12).all()
     assert (mixed >= rewards.min(-1, keepdims=True) - 1e-12).all()
-    np.testing.assert_allclose(mixed[1], mix_rewards(rewards[1], neighbors[1], lambda_))
+    for flock, vehicle in np.ndindex(3, 5):
+        own, others = rewards[flock, vehicle], rewards[flock, linked[flock, vehicle]]
+        expected = lambda_ * own + (1 - lambda_) * others.mean() if len(others) else own
+        assert mixed[flock, vehicle] == pytest.approx(expected)
 
 
-@pytest.mark.parametrize("lambda_", [0.0, 1.0])
-def test_the_ends_of_lambda(lambda_):
-    neighbors = ~np.eye(2, dtype=bool)
-    expected = [1.0, 5.0] if lambda_ == 1.0 else [5.0, 1.0]
-    np.testing.assert_allclose(mix_rewards(np.array([1.0, 5.0]), neighbors, lambda_), expected)
+@pytest.mark.parametrize(("lambda_", "expected"), [(0.0, [5.0, 1.0]), (1.0, [1.0, 5.0])])
+def test_the_ends_of_lambda(lambda_, expected):
+    np.testing.assert_allclose(mix_rewards(np.array([1.0, 5.0]), np.array([0, 1]), np.array([1, 0]), lambda_), expected)

@@ -1,35 +1,94 @@
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from sb3_flock.sim import sense
-from sb3_flock.sim.sensing import is_connected
+from sb3_flock.sim import Scenario, World, episode_rng, sense, sensing
+from sb3_flock.sim.sensing import Contacts, distance_blocks, find_contacts, is_connected, nearest
+
+
+def graph(links, n, flocks=1):
+    """Contacts of a graph given by undirected links, the same in every flock."""
+    pairs = sorted([(i, j) for i, j in links] + [(j, i) for i, j in links])
+    observers, bodies = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
+    observers = np.concatenate([observers + flock * n for flock in range(flocks)])
+    bodies = np.tile(bodies, flocks)
+    return Contacts((flocks, n), observers, bodies, np.zeros((len(bodies), 2)), np.zeros(len(bodies)))
 
 
 def test_the_body_frame_has_forward_on_x_and_left_on_y(scenario, place):
     # Vehicle 0 looks north: the vehicle east of it is on its right, the obstacle north of it ahead.
     world = place(scenario, [(0.0, 0.0), (0.1, 0.0)], [np.pi / 2, 0.0], obstacles=[(0.0, 0.2)], waypoint=(-0.3, 0.0))
-    sensing = sense(world)
-    np.testing.assert_allclose(sensing.neighbor_positions[0, 0, 1], (0.0, -0.1), atol=1e-15)
-    np.testing.assert_allclose(sensing.neighbor_positions[0, 1, 0], (-0.1, 0.0), atol=1e-15)
-    np.testing.assert_allclose(sensing.obstacle_positions[0, 0, 0], (0.2, 0.0), atol=1e-15)
-    np.testing.assert_allclose(sensing.waypoint_positions[0, 0], (0.0, 0.3), atol=1e-15)
-    np.testing.assert_allclose(sensing.waypoint_distances[0], (0.3, 0.4))
+    seen = sense(world)
+    np.testing.assert_array_equal(seen.neighbors.observers, [0, 1])
+    np.testing.assert_allclose(seen.neighbors.positions, [(0.0, -0.1), (-0.1, 0.0)], atol=1e-15)
+    np.testing.assert_allclose(seen.obstacles.positions[0], (0.2, 0.0), atol=1e-15)
+    np.testing.assert_allclose(seen.waypoint_positions[0, 0], (0.0, 0.3), atol=1e-15)
+    np.testing.assert_allclose(seen.waypoint_distances[0], (0.3, 0.4))
 
 
 def test_graphs_take_strictly_closer_bodies_and_never_the_vehicle_itself(scenario, place):
     wide = scenario.replace(link_range=0.25, detection_range=0.5, neighbor_separation=0.1)
     world = place(wide, [(0.0, 0.0), (0.25, 0.0), (0.0, 0.125)], [0.0] * 3, obstacles=[(0.0, -0.5), (0.0, -0.25)])
-    sensing = sense(world)
-    np.testing.assert_array_equal(sensing.neighbors[0], [[0, 0, 1], [0, 0, 0], [1, 0, 0]])
-    np.testing.assert_array_equal(sensing.detections[0, 0], [0, 1])
-    assert np.isinf(sensing.neighbor_distances[0].diagonal()).all()
+    seen = sense(world)
+    assert [bodies.tolist() for bodies in seen.neighbors.by_observer()] == [[2], [], [0]]
+    assert seen.obstacles.by_observer()[0].tolist() == [1]
+    np.testing.assert_array_equal(seen.neighbors.count(), [[1, 0, 1]])
+    np.testing.assert_array_equal(seen.neighbors.count(closer_than=0.125), [[0, 0, 0]])
+    np.testing.assert_allclose(seen.neighbors.sum(seen.neighbors.distances), [[0.125, 0.0, 0.125]])
 
 
 def test_one_vehicle_and_no_obstacle_leave_empty_graphs(scenario, place):
-    sensing = sense(place(scenario, [(0.0, 0.0)], [0.0]))
-    assert sensing.neighbors.sum() == 0
-    assert sensing.detections.shape == (1, 1, 0)
-    assert sensing.waypoint_distances[0, 0] == 0.0
+    seen = sense(place(scenario, [(0.0, 0.0)], [0.0]))
+    assert seen.neighbors.count().tolist() == seen.obstacles.count().tolist() == [[0]]
+    assert seen.neighbors.by_observer()[0].size == 0
+    assert seen.waypoint_distances[0, 0] == 0.0
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**31), st.integers(1, 3), st.integers(1, 40), st.integers(0, 20), st.floats(0.01, 0.8))
+def test_compiled_plain_and_by_cells_are_the_same_to_the_last_bit(seed, flocks, vehicles, obstacles, reach):
+    pytest.importorskip("numba")
+    rng = np.random.default_rng(seed)
+    positions, bodies = (rng.uniform(-1, 1, (flocks, count, 2)) for count in (vehicles, obstacles))
+    positions[rng.random((flocks, vehicles)) < 0.05] += 1e3  # far away
+    angles = rng.uniform(-np.pi, np.pi, (flocks, vehicles))
+    frames = np.stack((np.cos(angles), np.sin(angles)), axis=-1)
+    for others, seen in ((True, positions), (False, bodies)):
+        compiled, plain = (find_contacts(positions, frames, seen, reach, others, use) for use in (True, False))
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(sensing, "_FEW", -1)
+            by_cells = find_contacts(positions, frames, seen, reach, others)
+        for other in (plain, by_cells):
+            for name in ("observers", "bodies", "positions", "distances"):
+                np.testing.assert_array_equal(getattr(compiled, name), getattr(other, name))
+        distances = np.concatenate([block for _, block in distance_blocks(positions, seen, others)], axis=1)
+        np.testing.assert_array_equal(compiled.count(), (distances < reach).sum(-1))
+
+
+def test_ten_thousand_vehicles_sense_in_linear_memory(scenario):
+    many = Scenario(n_vehicles=10_000, n_obstacles=1_000, arena=50.0, max_cycles=2)
+    world = World(many)
+    seen = world.reset([episode_rng(0, 0)])
+    assert 0 < len(seen.neighbors.observers) < 100 * many.n_vehicles
+    i = seen.neighbors.observers[0]
+    there = np.linalg.norm(world.positions[0] - world.positions[0, i], axis=-1)
+    assert np.flatnonzero((there < many.link_range) & (there > 0)).tolist() == seen.neighbors.by_observer()[i].tolist()
+
+
+def test_distances_come_in_blocks_and_the_nearest_is_the_smallest(monkeypatch):
+    rng = np.random.default_rng(0)
+    positions, bodies = rng.normal(size=(2, 7, 2)), rng.normal(size=(2, 3, 2))
+    expected = np.linalg.norm(bodies[:, None] - positions[:, :, None], axis=-1)
+    monkeypatch.setattr(sensing, "_BLOCK", 13)  # two vehicles at a time
+    blocks = list(distance_blocks(positions, bodies))
+    assert [block.shape for _, block in blocks] == [(2, 2, 3)] * 3 + [(2, 1, 3)]
+    np.testing.assert_allclose(np.concatenate([block for _, block in blocks], axis=1), expected)
+    np.testing.assert_allclose(nearest(positions, bodies), expected.min(-1))
+    apart = np.linalg.norm(positions[:, None] - positions[:, :, None], axis=-1) + 9 * np.eye(7)
+    np.testing.assert_allclose(nearest(positions, positions, others=True), apart.min(-1))
+    assert np.isinf(nearest(positions, np.empty((2, 0, 2)))).all()
+    assert np.isinf(nearest(positions[:, :1], positions[:, :1], others=True)).all()
 
 
 @pytest.mark.parametrize(
@@ -40,10 +99,9 @@ def test_one_vehicle_and_no_obstacle_leave_empty_graphs(scenario, place):
         ([(0, 1)], 2, True),
         ([(0, 1), (2, 3)], 4, False),
         ([(i, i + 1) for i in range(8)], 9, True),
+        ([(0, 8), (8, 1), (1, 7), (7, 2), (2, 6), (6, 3), (3, 5), (5, 4)], 9, True),
+        ([(i, i + 1) for i in range(8) if i != 4], 9, False),
     ],
 )
 def test_connectivity_of_chains_and_islands(links, n, connected):
-    graph = np.zeros((2, n, n), dtype=bool)
-    for i, j in links:
-        graph[:, i, j] = graph[:, j, i] = True
-    np.testing.assert_array_equal(is_connected(graph), [connected, connected])
+    np.testing.assert_array_equal(is_connected(graph(links, n, flocks=2)), [connected, connected])

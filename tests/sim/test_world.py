@@ -4,6 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sb3_flock.sim import Scenario, World, episode_rng
+from sb3_flock.sim.sensing import nearest
 from sb3_flock.sim.world import WorldError
 
 
@@ -65,12 +66,12 @@ def test_the_walk_has_the_stated_distribution():
 def test_starts_lie_in_their_squares_and_keep_their_separations(seed, n_vehicles, n_obstacles):
     scenario = Scenario(n_vehicles=n_vehicles, n_obstacles=n_obstacles, obstacle_arena=0.7)
     world = World(scenario)
-    sensing = world.reset([episode_rng(seed, 0)])
+    world.reset([episode_rng(seed, 0)])
     assert np.abs(world.positions).max() <= 1.0
     assert np.abs(world.waypoints).max() <= 1.0
     assert np.abs(world.obstacle_positions).max(initial=0.0) <= 0.7
-    assert sensing.neighbor_distances.min() >= scenario.neighbor_separation
-    assert sensing.obstacle_distances.min(initial=np.inf) >= scenario.obstacle_separation
+    assert nearest(world.positions, world.positions, others=True).min() >= scenario.neighbor_separation
+    assert nearest(world.positions, world.obstacle_positions).min() >= scenario.obstacle_separation
 
 
 def test_a_crowded_arena_is_a_clear_error():
