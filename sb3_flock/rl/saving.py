@@ -7,10 +7,14 @@ networks from the member's plain values and loads the tensors alone.
 from __future__ import annotations
 
 import json
+import operator
 import os
 import platform
 import warnings
 import zipfile
+from collections import defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -80,15 +84,17 @@ def versions() -> dict[str, str]:
     return {"python": platform.python_version(), **{name: version(name) for name in PACKAGES}}
 
 
-def save_model(model: BaseAlgorithm, path: str | Path, config: TrainingConfig) -> Path:
+def save_model(model: BaseAlgorithm, path: str | Path, config: TrainingConfig, optimizers: bool = True) -> Path:
     """Save a model as SB3 does, with the JSON member, whole or not at all.
 
     :param path: the zip to write
+    :param optimizers: keep what the optimizers have gathered, which more training needs and flying does not; without it the
+        file is less than half as large
     :return: the path
     """
     path = Path(path)
     aside = path.with_name(f".{path.name}.tmp")
-    with open(aside, "wb") as file:
+    with open(aside, "wb") as file, nullcontext() if optimizers else _fresh_optimizers(model):
         model.save(file)
     member = {
         "format": FORMAT,
@@ -102,6 +108,20 @@ def save_model(model: BaseAlgorithm, path: str | Path, config: TrainingConfig) -
         os.fsync(file.fileno())
     os.replace(aside, path)
     return path
+
+
+@contextmanager
+def _fresh_optimizers(model: BaseAlgorithm) -> Iterator[None]:
+    """Optimizers as new while it lasts."""
+    found = [operator.attrgetter(name)(model) for name in model._get_torch_save_params()[0] if name.endswith("optimizer")]
+    states = [optimizer.state for optimizer in found]
+    for optimizer in found:
+        optimizer.state = defaultdict(dict)
+    try:
+        yield
+    finally:
+        for optimizer, state in zip(found, states, strict=True):
+            optimizer.state = state
 
 
 def check_device(device: str) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
+import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -109,10 +110,14 @@ class Evaluation(BaseCallback):
         self.config, self.folder, self.progress = config, folder, progress
         self.best_score = np.inf
         self._due = _Due(config.eval_freq)
-        self._history: dict[str, list[Any]] = {"timesteps": [], "results": [], "ep_lengths": []}
+        self._history: dict[str, list[Any]] = {"timesteps": [], "seconds": [], "results": [], "ep_lengths": []}
+        self._started = 0.0
 
     def _on_step(self) -> bool:
         return True
+
+    def _on_training_start(self) -> None:
+        self._started = time.monotonic()
 
     def _on_rollout_end(self) -> None:
         if self._due(self.num_timesteps):
@@ -131,6 +136,7 @@ class Evaluation(BaseCallback):
             self.logger.record(f"eval/{name}", mean)
             self._history.setdefault(name, []).append(mean)
         self._history["timesteps"].append(self.num_timesteps)
+        self._history["seconds"].append(time.monotonic() - self._started)
         self._history["results"].append(values["return"])
         self._history["ep_lengths"].append([config.scenario.max_cycles] * config.eval_episodes)
         history: dict[str, Any] = {name: np.asarray(rows) for name, rows in self._history.items()}
@@ -138,7 +144,7 @@ class Evaluation(BaseCallback):
         is_best = current < self.best_score
         if is_best:
             self.best_score = current
-            save_model(self.model, self.folder / "best_model.zip", config)
+            save_model(self.model, self.folder / "best_model.zip", config, optimizers=False)
         self.logger.dump(self.num_timesteps)
         self.progress.report_evaluation(
             f"evaluation at {self.num_timesteps}: tracking {means['tracking_error']:.3f} m, "

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch as th
 
-from sb3_flock import load_policy, make_vec_env, save_model
+from sb3_flock import FlockDDPG, load_policy, make_vec_env, save_model
 from sb3_flock.rl.algorithms import build_model
 from sb3_flock.rl.config import TrainingConfig
 from sb3_flock.rl.config_io import load_config
@@ -43,6 +43,21 @@ def test_what_is_saved_is_what_loads(model, saved):
     np.testing.assert_array_equal(policy.predict(observations)[0], model.predict(observations, deterministic=True)[0])
     assert [path.name for path in saved.parent.iterdir()] == ["policy.zip"]
     assert load_policy(saved, device="auto").config == CONFIG
+
+
+def test_without_what_the_optimizers_gathered_a_file_is_small_flies_the_same_and_trains_on(tmp_path):
+    config = CONFIG.replace(learner=CONFIG.learner.replace(learning_starts=3))
+    model = build_model(config, make_vec_env(config.scenario, 1, seed=0))
+    model.learn(12)
+    whole, slim = (save_model(model, tmp_path / f"{name}.zip", config, name == "whole") for name in ("whole", "slim"))
+    assert slim.stat().st_size < 0.75 * whole.stat().st_size
+    assert model.actor.optimizer.state  # the model keeps its own
+    observations = np.random.default_rng(0).random((4, 3, 11, 11)).astype(np.float32)
+    np.testing.assert_array_equal(load_policy(slim).predict(observations)[0], load_policy(whole).predict(observations)[0])
+    loaded = FlockDDPG.load(slim, env=model.get_env())
+    assert not loaded.actor.optimizer.state
+    loaded.learn(12)
+    assert loaded.actor.optimizer.state
 
 
 def test_a_run_folder_means_its_best_model_else_its_final(saved, tmp_path):

@@ -82,6 +82,7 @@ def test_the_run_folder_holds_what_is_promised(tmp_path):
     assert evaluations["timesteps"].tolist() == [120, 240, 300]
     assert evaluations["results"].shape == evaluations["ep_lengths"].shape == (3, 2)
     assert {"tracking_error", "score", "connectivity"} <= set(evaluations)
+    assert (np.diff(evaluations["seconds"]) > 0).all()
 
 
 def test_the_best_model_is_the_one_that_scored_best(tmp_path):

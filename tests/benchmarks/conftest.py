@@ -1,0 +1,28 @@
+"""What the benchmarks share: one torch thread, the peers' own Python, and figures that land in the JSON."""
+
+import json
+import os
+import subprocess
+from pathlib import Path
+
+import pytest
+
+PEERS = Path(__file__).parent / "peers"
+
+
+@pytest.fixture
+def peer(request):
+    """Run one of the peers' scripts by the Python in ``SB3_FLOCK_PEERS`` and return what it measured; skip without it."""
+    python = os.environ.get("SB3_FLOCK_PEERS")
+    if python is None or request.config.getoption("benchmark_disable"):
+        pytest.skip("the peers are measured only where SB3_FLOCK_PEERS names the Python of their own environment")
+
+    def measure(script, *words):
+        one_thread = {**os.environ, "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
+        command = [python, str(PEERS / script), *map(str, words)]
+        done = subprocess.run(command, env=one_thread, capture_output=True, text=True, timeout=900, check=False)
+        if done.returncode:
+            pytest.skip(f"{script} {words[0]} does not run there: {done.stderr.strip().splitlines()[-1][:200]}")
+        return json.loads(done.stdout.strip().splitlines()[-1])
+
+    return measure

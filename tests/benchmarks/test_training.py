@@ -1,0 +1,152 @@
+"""The speed of training and of evaluation, one core."""
+
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+from stable_baselines3 import DDPG
+from stable_baselines3.common.logger import configure
+
+from sb3_flock import CompactReplayBuffer, FlockCNN, FlockDDPG, FlockPolicy, evaluate, load_policy, make_vec_env, train
+from sb3_flock.rl.algorithms import policy_kwargs
+from sb3_flock.rl.config import TrainingConfig
+from sb3_flock.rl.config_io import load_config
+
+POLICY = Path(__file__).parents[2] / "examples" / "policies" / "ddpg_5v2o.zip"
+CONFIG = load_config(TrainingConfig, overrides={"n_vehicles": 5, "n_obstacles": 2})
+UPDATES = 25
+
+
+class PlainCNN(FlockCNN):
+    """The same network in torch's own convolutions."""
+
+    def forward(self, observations):
+        return self.dense(self.cnn(observations))
+
+
+KINDS = {
+    "stock": (DDPG, PlainCNN, False, None),  # SB3's DDPG, torch's convolutions and Adam, SB3's buffer
+    "stock with our extractor and fused Adam": (DDPG, FlockCNN, True, None),  # --algo ddpg-stock
+    "ours": (FlockDDPG, FlockCNN, True, CompactReplayBuffer),  # --algo ddpg
+}
+
+
+def learner(kind, env):
+    """A model whose buffer is filled and which has not learned yet."""
+    algorithm, extractor, fused, buffer = KINDS[kind]
+    model = algorithm(
+        FlockPolicy,
+        env,
+        batch_size=CONFIG.learner.batch_size,
+        buffer_size=10_000,
+        learning_starts=10_000,
+        replay_buffer_class=buffer,
+        policy_kwargs={
+            **policy_kwargs(CONFIG), "features_extractor_class": extractor, "optimizer_kwargs": {"fused": fused},
+        },
+        seed=0,
+        device="cpu",
+    )  # fmt: skip
+    model.set_logger(configure(None, []))
+    model.learn(3_200)
+    return model
+
+
+def test_updates(benchmark):
+    """Rounds of updates of each kind in turn, so that whatever else the machine does falls on all of them."""
+    env = make_vec_env(CONFIG.flown_scenario(), 8, seed=0)
+    models = {kind: learner(kind, env) for kind in KINDS}
+    seconds = {kind: [] for kind in KINDS}
+
+    def one_round():
+        for kind, model in models.items():
+            start = time.perf_counter()
+            model.train(UPDATES, CONFIG.learner.batch_size)
+            seconds[kind].append(time.perf_counter() - start)
+
+    benchmark.pedantic(one_round, rounds=20, warmup_rounds=2)
+    times = {kind: np.array(spent[2:]) for kind, spent in seconds.items()}
+    if benchmark.disabled:
+        return
+    for kind, spent in times.items():
+        ratios = np.percentile(times["stock"] / spent, [10, 50, 90])
+        benchmark.extra_info[kind] = {
+            "updates_per_second": UPDATES / float(np.median(spent)),
+            "times_stock": dict(zip(("p10", "median", "p90"), ratios.tolist(), strict=True)),
+        }
+
+
+def test_where_a_second_of_training_goes(benchmark, tmp_path, monkeypatch):
+    """Shares of ``sb3-flock train``'s time, evaluations as often as it has them."""
+    spent = {}
+
+    def timed(owner, name, key):
+        original = getattr(owner, name)
+
+        def call(*args, **kwargs):
+            start = time.perf_counter()
+            try:
+                return original(*args, **kwargs)
+            finally:
+                spent[key] = spent.get(key, 0.0) + time.perf_counter() - start
+
+        monkeypatch.setattr(owner, name, call)
+
+    from sb3_flock.envs.vec_env import ParameterSharingVecEnv
+    from sb3_flock.rl import training
+
+    timed(FlockDDPG, "train", "updates")
+    timed(CompactReplayBuffer, "sample", "updates: sampling the replay buffer")
+    timed(ParameterSharingVecEnv, "step_wait", "environment, SuperSuit included")
+    timed(training.Evaluation, "_evaluate", "evaluation")
+    timed(CompactReplayBuffer, "add", "replay buffer, storing")
+    short = 20 * 32 if benchmark.disabled else 20_000
+    config = CONFIG.replace(total_timesteps=short, output_dir=str(tmp_path), eval_freq=10_000, save_freq=0)
+
+    def run():
+        spent.clear()
+        train(config, Console(quiet=True))
+
+    benchmark.pedantic(run, rounds=1)
+    if benchmark.disabled:
+        return
+    whole = benchmark.stats.stats.median
+    benchmark.extra_info |= {"transitions_per_second": short / whole}
+    benchmark.extra_info |= {f"share of {key}": seconds / whole for key, seconds in spent.items()}
+
+
+def test_a_thousand_episodes(benchmark):
+    policy = load_policy(POLICY)
+    episodes = 2 if benchmark.disabled else 1000
+    benchmark.pedantic(evaluate, (policy,), {"episodes": episodes}, rounds=3, warmup_rounds=0)
+
+
+@pytest.mark.parametrize("name", ["iddpg", "maddpg", "sbx"])
+def test_peers_in_training(benchmark, peer, tmp_path, name):
+    """Ours and a peer one after the other: 5 agents, 8 flocks, the same batch and update ratio; see the peer's script."""
+    seconds, updates = [], []
+    config = CONFIG.replace(
+        total_timesteps=16_000, output_dir=str(tmp_path), eval_freq=0, save_freq=0,
+        practice=CONFIG.practice.replace(max_vehicles=5),
+        learner=CONFIG.learner.replace(learning_starts=1_000),
+    )  # fmt: skip
+
+    def run():
+        start = time.perf_counter()
+        updates.append(train(config, Console(quiet=True)).model._n_updates)
+        seconds.append(time.perf_counter() - start)
+
+    benchmark.pedantic(run, rounds=1)
+    theirs = peer(
+        "training.py", name, "--vehicles", 5, "--flocks", 8, "--batch", config.learner.batch_size,
+        "--update-ratio", config.learner.update_ratio, "--seconds", 60,
+    )  # fmt: skip
+    ours = {
+        "env_steps_per_second": config.total_timesteps / seconds[-1],
+        "updates_per_second": updates[-1] / seconds[-1],
+    }
+    benchmark.extra_info |= {"ours": ours, name: theirs}
+    for key, value in ours.items():
+        benchmark.extra_info[f"times_{name}: {key}"] = value / theirs[key]

@@ -1,0 +1,115 @@
+"""The world's speed: dynamics, graph, tensor, reward and mix, one core.
+
+The flocks fly as a trained policy flies them: together and settled, by the actions it chose beforehand.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sb3_flock import Scenario, World, load_policy
+from sb3_flock.evaluation.episodes import PolicyController
+from sb3_flock.sim import episode_rng, mix_rewards, observe, own_reward, reward_terms, sensing
+from sb3_flock.sim.backend import compiled
+
+POLICY = Path(__file__).parents[2] / "examples" / "policies" / "ddpg_5v2o.zip"
+SETTLED, STEPS = 120, 40
+
+
+def advance(world, actions):
+    """One whole vehicle-step for every vehicle."""
+    scenario = world.scenario
+    sensed, clipped = world.step(actions)
+    observe(sensed, scenario)
+    rewards = own_reward(reward_terms(sensed, clipped, scenario))
+    mix_rewards(rewards, sensed.neighbors.observers, sensed.neighbors.vehicles, scenario.reward.lambda_)
+
+
+def without_numba(monkeypatch):
+    for module in ("sensing", "observation"):
+        monkeypatch.setattr(f"sb3_flock.sim.{module}.compiled", lambda: None)
+
+
+@pytest.mark.parametrize("kind", ["numba", "numpy"])
+@pytest.mark.parametrize("n_flocks", [1, 64, 1024])
+def test_vehicle_steps(benchmark, peer_of_world, monkeypatch, n_flocks, kind):
+    if kind == "numpy":
+        without_numba(monkeypatch)
+    elif compiled() is None:
+        pytest.skip("numba is not installed")
+    policy = load_policy(POLICY)
+    controller, world = PolicyController(policy), World(policy.scenario, n_flocks)
+    sensed = world.reset([episode_rng(0, episode) for episode in range(n_flocks)])
+    for _ in range(SETTLED):
+        sensed, _ = world.step(controller.act(sensed, policy.scenario))
+    start, actions = dict(vars(world)), []
+    for _ in range(STEPS):
+        actions.append(controller.act(sensed, policy.scenario))
+        sensed, _ = world.step(actions[-1])
+
+    def fly():
+        vars(world).update(start)
+        for action in actions:
+            advance(world, action)
+
+    benchmark.pedantic(fly, rounds=15, warmup_rounds=2)
+    if benchmark.disabled:
+        return
+    vehicle_steps = n_flocks * policy.scenario.n_vehicles * STEPS
+    speed = vehicle_steps / benchmark.stats.stats.median
+    image = np.empty((n_flocks * policy.scenario.n_vehicles, *policy.scenario.observation_shape), np.float32)
+    benchmark.extra_info |= {
+        "vehicle_steps_per_second": speed,
+        "neighbors": float(sensed.neighbors.count().mean()),
+        "bytes_of_tensor_per_vehicle_step": image[0].nbytes,
+    }
+    peer_of_world(benchmark, speed, "vmas", n_flocks, 5, 2)
+
+
+@pytest.mark.parametrize("n_vehicles", [10, 100, 1_000, 10_000, 100_000])
+def test_seconds_per_step_of_one_crowd(benchmark, peer_of_world, n_vehicles):
+    """One world of constant density: four neighbors within range on average, an obstacle for ten vehicles."""
+    side = np.sqrt(n_vehicles * np.pi * Scenario().link_range ** 2 / 4)
+    scenario = Scenario(
+        n_vehicles=n_vehicles, n_obstacles=n_vehicles // 10, arena=side / 2, neighbor_separation=0.0, obstacle_separation=0.0,
+        max_cycles=200,
+    )  # fmt: skip
+    world = World(scenario)
+    sensed = world.reset([episode_rng(0, 0)])
+    rng = np.random.default_rng(0)
+    actions = rng.uniform(world.action_low, world.action_high, (1, n_vehicles, 2))
+    benchmark.pedantic(advance, (world, actions), rounds=20, warmup_rounds=3)
+    if benchmark.disabled:
+        return
+    seconds = benchmark.stats.stats.median
+    benchmark.extra_info |= {
+        "seconds_per_step": seconds,
+        "neighbors": float(sensed.neighbors.count().mean()),
+        "microseconds_per_vehicle": 1e6 * seconds / n_vehicles,
+    }
+    for name, most in (("vmas", 1_000), ("mpe2", 1_000)):
+        if n_vehicles <= most:
+            peer_of_world(benchmark, n_vehicles / seconds, name, 1, n_vehicles, n_vehicles // 10)
+
+
+@pytest.fixture
+def peer_of_world(request):
+    """Measure a peer on the same numbers of flocks, vehicles and obstacles and note it beside ours."""
+
+    def compare(benchmark, speed, name, flocks, vehicles, obstacles):
+        try:
+            measure = request.getfixturevalue("peer")
+        except pytest.skip.Exception:
+            return  # ours alone
+        words = (name, "--flocks", flocks, "--vehicles", vehicles, "--obstacles", obstacles, "--seconds", 3)
+        theirs = measure("worlds.py", *words)
+        benchmark.extra_info[name] = theirs
+        benchmark.extra_info[f"times_{name}"] = speed / theirs["vehicle_steps_per_second"]
+
+    return compare
+
+
+def test_the_plain_path_is_the_one_that_is_measured_as_plain(monkeypatch):
+    without_numba(monkeypatch)
+    assert sensing.compiled() is None
