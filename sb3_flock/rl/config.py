@@ -67,7 +67,7 @@ class PracticeConfig(Settings):
         0.5, gt=0, description="side of the obstacles' square, relative to the task's (ours; paper: 1)"
     )
     separation_ratio: float = Field(
-        1.06, ge=1, description="minimum separation to neighbors, relative to the task's (ours; paper: 1)"
+        1.1, ge=1, description="minimum separation to neighbors, relative to the task's (ours; paper: 1)"
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -58,7 +59,7 @@ def reward_terms(sensing: Sensing, actions: NDArray[np.float64], scenario: Scena
 
 def own_reward(terms: dict[str, NDArray[np.float64]]) -> NDArray[np.float64]:
     """r_i, the sum of its terms (section IV-B)."""
-    return np.add.reduce(list(terms.values()))
+    return functools.reduce(np.add, terms.values())
 
 
 def mix_rewards(

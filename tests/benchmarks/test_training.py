@@ -130,7 +130,7 @@ def test_peers_in_training(benchmark, peer, tmp_path, name):
     config = CONFIG.replace(
         total_timesteps=16_000, output_dir=str(tmp_path), eval_freq=0, save_freq=0,
         practice=CONFIG.practice.replace(max_vehicles=5),
-        learner=CONFIG.learner.replace(learning_starts=1_000),
+        learner=CONFIG.learner.replace(learning_starts=200),
     )  # fmt: skip
 
     def run():

@@ -5,9 +5,9 @@ JSON::
 
     python training.py iddpg --vehicles 5 --flocks 8 --batch 128 --update-ratio 0.2 --seconds 60
 
-``iddpg`` and ``maddpg`` are BenchMARL's, on its VMAS flocking task: DDPG with one policy for all agents, whose critic sees one
-agent or all of them. ``sbx`` is the DDPG of SBX (JAX) on sb3_flock's own vector env. A transition is one step of one agent,
-as in sb3_flock. All networks are multilayer perceptrons of the same width, as SBX's DDPG has no convolutions.
+``iddpg`` and ``maddpg`` are BenchMARL's, on its VMAS flocking task: DDPG with one policy for all agents, whose critic sees
+one agent or all of them. ``sbx`` is the DDPG of SBX (JAX) on sb3_flock's own vector env. A transition is one step of one
+agent, as in sb3_flock. All networks are multilayer perceptrons of the same width, as SBX's DDPG has no convolutions.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def train_benchmarl(algorithm: str, args: argparse.Namespace, stopwatch: Stopwat
 
     torch.set_num_threads(1)
 
-    class Count(Callback):  # type: ignore[misc]
+    class Count(Callback):
         """Counts optimizer steps, and frames once they are learned from."""
 
         def __init__(self) -> None:
@@ -88,9 +88,9 @@ def train_benchmarl(algorithm: str, args: argparse.Namespace, stopwatch: Stopwat
         def on_train_end(self, training_td: Any, group: str) -> None:
             stopwatch.check(self.experiment.total_frames * args.vehicles, self.updates)
 
-    # BenchMARL counts in frames; a frame is a step of one flock and holds a transition of every agent in it. A round collects
-    # ROUND vector steps, ROUND * flocks frames, and updates `update_ratio` times for each of their transitions. A batch has as
-    # many frames as hold `batch` transitions.
+    # BenchMARL counts in frames; a frame is a step of one flock and holds a transition of every agent in it. A round
+    # collects ROUND vector steps, ROUND * flocks frames, and updates `update_ratio` times for each of their transitions.
+    # A batch has as many frames as hold `batch` transitions.
     frames_per_round = ROUND * args.flocks
     frames_per_batch = -(-args.batch // args.vehicles)
     config = ExperimentConfig.get_from_yaml()
@@ -141,7 +141,7 @@ def train_sbx(args: argparse.Namespace, stopwatch: Stopwatch) -> dict[str, Any]:
 
     from sb3_flock import Scenario, make_vec_env
 
-    class Watch(BaseCallback):  # type: ignore[misc]
+    class Watch(BaseCallback):
         """Looks at the stopwatch between updates and the next vector step."""
 
         def _on_step(self) -> bool:

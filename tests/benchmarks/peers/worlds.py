@@ -6,8 +6,8 @@ Run by the Python of the peers' own environment (requirements.txt beside this fi
     python worlds.py mpe2 --vehicles 5 --seconds 3
 
 ``vmas`` is VMAS's own flocking scenario, all flocks in one batch of tensors; ``mpe2`` is MPE2's simple_spread, one world of
-Python objects with as many landmarks as agents. Neither is the task of sb3_flock: bodies, sensors and rewards differ. Actions
-are random and drawn beforehand; an episode has 200 steps, and its reset is part of the measurement.
+Python objects with as many landmarks as agents. Neither is the task of sb3_flock: bodies, sensors and rewards differ.
+Actions are random and drawn beforehand; an episode has 200 steps, and its reset is part of the measurement.
 """
 
 from __future__ import annotations
@@ -38,7 +38,13 @@ def vmas_world(flocks: int, vehicles: int, obstacles: int) -> tuple[Callable[[],
 
     torch.set_num_threads(1)
     env = vmas.make_env(
-        scenario="flocking", num_envs=flocks, device="cpu", seed=0, max_steps=EPISODE, n_agents=vehicles, n_obstacles=obstacles
+        scenario="flocking",
+        num_envs=flocks,
+        device="cpu",
+        seed=0,
+        max_steps=EPISODE,
+        n_agents=vehicles,
+        n_obstacles=obstacles,
     )
     actions = cycle([env.get_random_actions() for _ in range(DRAWS)])
     observation_size = env.reset()[0].shape[1]
