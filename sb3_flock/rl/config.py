@@ -92,7 +92,9 @@ class TrainingConfig(Settings):
     num_cpus: int = Field(0, ge=0, description="SuperSuit worker processes; 0: fly in the training process (faster)")
     seed: int = Field(0, ge=0, le=2**32 - 1, description="seed of the networks, the noise and the flocks")
     device: str = Field("cpu", description="torch device: cpu, cuda, cuda:0, ... or auto")
-    torch_threads: int = Field(1, ge=0, description="torch threads; 1 is fastest for networks this small; 0: torch's choice")
+    torch_threads: int = Field(
+        0, ge=0, description="torch threads; 0: one for batches under 1024, where more gain nothing, else one for each core"
+    )
 
     eval_freq: int = Field(10_000, ge=0, description="transitions between evaluations; 0: none")
     eval_episodes: int = Field(100, ge=1, description="episodes of an evaluation, the same ones every time")

@@ -14,7 +14,8 @@ PEERS = Path(__file__).parent / "peers"
 def peer(request):
     """Run one of the peers' scripts by the Python in ``SB3_FLOCK_PEERS`` and return what it measured; skip without it."""
     python = os.environ.get("SB3_FLOCK_PEERS")
-    if python is None or request.config.getoption("benchmark_disable"):
+    option = request.config.getoption
+    if python is None or (option("benchmark_disable") and not option("benchmark_enable")):
         pytest.skip("the peers are measured only where SB3_FLOCK_PEERS names the Python of their own environment")
 
     def measure(script, *words):

@@ -14,6 +14,7 @@ from sb3_flock.rl.algorithms import ALGORITHMS
 from sb3_flock.rl.config import TrainingConfig
 from sb3_flock.rl.config_io import load_config
 from sb3_flock.rl.saving import PolicyError
+from sb3_flock.rl.training import _cores
 from sb3_flock.settings import UserError
 
 TINY = {
@@ -91,6 +92,12 @@ def test_the_best_model_is_the_one_that_scored_best(tmp_path):
     best = load_policy(result.folder)
     assert best.path == result.best_model
     assert best.num_timesteps == evaluations["timesteps"][evaluations["score"].argmin()]
+
+
+@pytest.mark.parametrize(("threads", "batch_size", "expected"), [(0, 128, 1), (0, 1024, _cores()), (2, 128, 2)])
+def test_threads_are_chosen_by_the_batch_and_the_machine_unless_given(tmp_path, threads, batch_size, expected):
+    train(tiny(tmp_path, torch_threads=threads, batch_size=batch_size, eval_freq=0, save_freq=0), quiet())
+    assert th.get_num_threads() == expected
 
 
 def test_one_seed_trains_the_same_policy_twice_and_another_a_different_one(tmp_path):
