@@ -13,6 +13,9 @@ if TYPE_CHECKING:
 
     from sb3_flock.sim.sensing import Pairs
 
+_CHUNK = 64
+"""Bodies whose factors are computed side by side."""
+
 
 @njit(cache=True)
 def find_contacts(
@@ -42,48 +45,70 @@ def find_contacts(
 
 
 @njit(error_model="numpy", cache=True)
-def add_gaussians(
+def paint(
     tensor: NDArray[np.float32],
     channel: int,
     observers: NDArray[np.int64],
     positions: NDArray[np.float64],
     radius: float,
     sigma: float,
+    row: tuple[int, ...],
 ) -> None:
-    """:func:`sb3_flock.sim.observation.add_gaussians`."""
-    side = tensor.shape[-1]
-    along_x, along_y = np.empty(side, np.float32), np.empty(side, np.float32)
+    """:func:`sb3_flock.sim.observation.paint`, some bodies at a time.
+
+    :param row: as many numbers as a row has anchors: a tuple's length is known to the compiler, which then unrolls the loops
+    """
+    side = len(row)
     spacing = 2 * radius / (side - 1)
     step = spacing / sigma
-    half, shrink = math.exp(-0.5 * step * step), math.exp(-step * step)
-    for contact in range(len(observers)):
-        _gaussian(along_x, positions[contact, 0] + radius, spacing, step, half, shrink)
-        _gaussian(along_y, positions[contact, 1] + radius, spacing, step, half, shrink)
-        plane = tensor[observers[contact], channel]
-        for a in range(side):
-            factor = along_x[a]
+    along_x, along_y = np.empty((side, _CHUNK), np.float32), np.empty((side, _CHUNK), np.float32)
+    x, y = np.zeros(_CHUNK), np.zeros(_CHUNK)
+    factors = np.empty(side, np.float32)
+    beyond = 40.0 / step  # anchor spacings from the edge; a body farther out shows nowhere
+    last = -1
+    for start in range(0, len(observers), _CHUNK):
+        count = min(_CHUNK, len(observers) - start)
+        for i in range(count):
+            x[i] = min(max((positions[start + i, 0] + radius) / spacing, -beyond), side - 1 + beyond)
+            y[i] = min(max((positions[start + i, 1] + radius) / spacing, -beyond), side - 1 + beyond)
+        _gaussians(along_x, x, step, row)
+        _gaussians(along_y, y, step, row)
+        for i in range(count):
+            observer = observers[start + i]
+            plane = tensor[observer, channel]
             for b in range(side):
-                plane[a, b] += factor * along_y[b]
+                factors[b] = along_y[b, i]
+            if observer == last:
+                for a in range(side):
+                    for b in range(side):
+                        plane[a, b] += along_x[a, i] * factors[b]
+            else:
+                for blank in range(last + 1, observer):
+                    tensor[blank, channel] = 0
+                for a in range(side):
+                    for b in range(side):
+                        plane[a, b] = along_x[a, i] * factors[b]
+                last = observer
+    for blank in range(last + 1, len(tensor)):
+        tensor[blank, channel] = 0
 
 
 @njit(error_model="numpy", cache=True)
-def _gaussian(out: NDArray[np.float32], x: float, spacing: float, step: float, half: float, shrink: float) -> None:
-    """exp(-d^2 / 2) at every anchor, d the distance in units of sigma, from the nearest anchor outwards.
+def _gaussians(out: NDArray[np.float32], x: NDArray[np.float64], step: float, row: tuple[int, ...]) -> None:
+    """exp(-d^2 / 2) at every anchor (rows) for every body (columns), d the distance in units of sigma.
 
-    The ratio of neighboring anchors' values changes by the factor ``shrink`` = exp(-step^2) from anchor to anchor, so two
-    exponentials do for all of them. The anchors are ``step`` sigma or ``spacing`` apart, x is counted from the first one.
+    The ratio of neighboring anchors' values changes by the factor exp(-step^2) from anchor to anchor, so two exponentials a
+    body do for all anchors. The anchors are ``step`` sigma apart; x counts them from the first one.
     """
-    middle = min(max(int(x / spacing + 0.5), 0), len(out) - 1)
-    distance = (x / spacing - middle) * step
-    peak, lean = math.exp(-0.5 * distance * distance), math.exp(step * distance)
-    out[middle] = peak
-    value, ratio = peak, half * lean
-    for anchor in range(middle + 1, len(out)):
-        value *= ratio
-        ratio *= shrink
-        out[anchor] = value
-    value, ratio = peak, half / lean
-    for anchor in range(middle - 1, -1, -1):
-        value *= ratio
-        ratio *= shrink
-        out[anchor] = value
+    shrink = math.exp(-step * step)
+    values, ratios = np.empty(_CHUNK), np.empty(_CHUNK)
+    for i in range(_CHUNK):
+        values[i] = math.exp(-0.5 * (x[i] * step) ** 2)
+        ratios[i] = math.exp(step * step * (x[i] - 0.5))
+    for anchor in range(len(row)):
+        for i in range(_CHUNK):
+            out[anchor, i] = values[i]
+        for i in range(_CHUNK):
+            values[i] *= ratios[i]
+        for i in range(_CHUNK):
+            ratios[i] *= shrink

@@ -27,7 +27,7 @@ def observe(sensing: Sensing, scenario: Scenario, compile_it: bool = True) -> ND
     :return: ``(flocks, vehicles, 3, l, l)``, a fresh array
     """
     shape = sensing.waypoint_distances.shape
-    tensor = np.zeros((shape[0] * shape[1], *scenario.observation_shape), dtype=np.float32)
+    tensor = np.empty((shape[0] * shape[1], *scenario.observation_shape), dtype=np.float32)
     reach = np.maximum(sensing.waypoint_distances / scenario.goal_radius, 1.0)
     waypoints = (sensing.waypoint_positions / reach[..., None]).reshape(-1, 2)
     bodies = (
@@ -35,15 +35,18 @@ def observe(sensing: Sensing, scenario: Scenario, compile_it: bool = True) -> ND
         (sensing.obstacles.observers, sensing.obstacles.positions),
         (np.arange(len(waypoints)), waypoints),
     )
-    kernels = compiled() if compile_it else None
-    add = add_gaussians if kernels is None else kernels.add_gaussians
+    # From the first anchor to the last, the compiled Gaussians must not underflow on their way.
+    kernels = compiled() if compile_it and scenario.n_anchors - 1 <= 30 * scenario.anchor_width else None
     for channel, ((observers, positions), radius) in enumerate(zip(bodies, scenario.channel_radii, strict=True)):
         sigma = scenario.anchor_width * 2 * radius / (scenario.n_anchors - 1)
-        add(tensor, channel, observers, positions, radius, sigma)
+        if kernels is None:
+            paint(tensor, channel, observers, positions, radius, sigma)
+        else:
+            kernels.paint(tensor, channel, observers, positions, radius, sigma, (0,) * scenario.n_anchors)
     return tensor.reshape(*shape, *scenario.observation_shape)
 
 
-def add_gaussians(
+def paint(
     tensor: NDArray[np.float32],
     channel: int,
     observers: NDArray[np.int64],
@@ -51,7 +54,7 @@ def add_gaussians(
     radius: float,
     sigma: float,
 ) -> None:
-    """Add each body's Gaussian to its observer's channel.
+    """Fill one channel with the sums of its bodies' Gaussians.
 
     The Gaussian of a diagonal Sigma is a product of one factor along x and one along y, so the exponential is taken 2 l times
     a body, not l^2 times.
@@ -63,6 +66,7 @@ def add_gaussians(
     :param sigma: standard deviation [m]
     """
     anchors = np.linspace(-radius, radius, tensor.shape[-1])
+    tensor[:, channel] = 0
     factors = np.exp(-0.5 * np.square((positions[..., None] - anchors) / sigma)).astype(np.float32)
     counts = np.bincount(observers)
     rank = np.arange(len(observers)) - (np.cumsum(counts) - counts)[observers]  # first, second, ... of its observer

@@ -151,7 +151,7 @@ def _unicycle(
 
 def wrap_angle(angles: NDArray[np.float64]) -> NDArray[np.float64]:
     """Angles in [-pi, pi) [rad]."""
-    return (angles + np.pi) % (2 * np.pi) - np.pi
+    return angles - 2 * np.pi * np.floor((angles + np.pi) / (2 * np.pi))
 
 
 class _Placed:
