@@ -52,7 +52,7 @@ def reward_terms(sensing: Sensing, actions: NDArray[np.float64], scenario: Scena
         "connectivity": weights.link_bonus * linked - weights.separation_penalty * too_close,
         "obstacle": -weights.obstacle_penalty * sensing.obstacles.count(scenario.obstacle_separation),
         "waypoint": -weights.epsilon * sensing.waypoint_distances,
-        "control": weights.beta * np.square(actions).sum(-1),
+        "control": weights.beta * (np.square(actions[..., 0]) + np.square(actions[..., 1])),
     }
     return {name: weights.scale * term for name, term in terms.items()}
 

@@ -81,7 +81,7 @@ class Sensing:
 def sense(world: World) -> Sensing:
     """Everything the vehicles of every flock sense in the world's present state (section III-A)."""
     scenario, positions = world.scenario, world.positions
-    frames = np.stack((np.cos(world.headings), np.sin(world.headings)), axis=-1)
+    frames = world.frames
     offsets = world.waypoints[:, None, :] - positions
     return Sensing(
         neighbors=find_contacts(positions, frames, positions, scenario.link_range, others=True),

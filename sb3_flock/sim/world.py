@@ -43,8 +43,6 @@ class World:
 
     positions: NDArray[np.float64]
     """``(flocks, vehicles, 2)`` [m]."""
-    headings: NDArray[np.float64]
-    """``(flocks, vehicles)`` [rad], in [-pi, pi)."""
     obstacle_positions: NDArray[np.float64]
     """``(flocks, obstacles, 2)`` [m]."""
     obstacle_headings: NDArray[np.float64]
@@ -59,6 +57,27 @@ class World:
         self.n_flocks = n_flocks
         self.action_low = np.array([0.0, -scenario.max_turn_rate])
         self.action_high = np.array([scenario.max_speed, scenario.max_turn_rate])
+        # As large as the actions: NumPy is slow where it repeats a bound along a last axis this short.
+        shape = (n_flocks, scenario.n_vehicles, 2)
+        self._bounds = [np.broadcast_to(bound, shape).copy() for bound in (self.action_low, self.action_high)]
+
+    @property
+    def headings(self) -> NDArray[np.float64]:
+        """``(flocks, vehicles)`` [rad], in [-pi, pi). Read-only: assign another array to change them."""
+        return self._headings
+
+    @headings.setter
+    def headings(self, headings: NDArray[np.float64]) -> None:
+        self._headings = headings.view()
+        self._headings.flags.writeable = False
+        self._frames: NDArray[np.float64] | None = None
+
+    @property
+    def frames(self) -> NDArray[np.float64]:
+        """Cosine and sine of the headings, ``(flocks, vehicles, 2)``."""
+        if self._frames is None:
+            self._frames = _directions(self._headings)
+        return self._frames
 
     def reset(self, rngs: Sequence[Generator]) -> Sensing:
         """Start an episode in every flock (section V).
@@ -96,9 +115,10 @@ class World:
         scenario = self.scenario
         if not hasattr(self, "steps") or self.steps >= scenario.max_cycles:
             raise RuntimeError("the episode is over or not begun: call reset() first")
-        clipped = np.clip(np.asarray(actions, dtype=np.float64), self.action_low, self.action_high)
+        clipped = np.clip(np.asarray(actions, dtype=np.float64), *self._bounds)
         dt = scenario.time_step
-        self.positions, self.headings = _unicycle(self.positions, self.headings, clipped[..., 0], clipped[..., 1], dt)
+        self.positions = _moved(self.positions, self.frames, clipped[..., 0], dt)
+        self.headings = wrap_angle(self.headings + clipped[..., 1] * dt)
         self._move_obstacles(dt)
         distance = np.sqrt(np.square(self.waypoints).sum(-1, keepdims=True))
         stride = scenario.waypoint_speed * dt
@@ -109,14 +129,10 @@ class World:
     def _move_obstacles(self, dt: float) -> None:
         """The random walk: a unicycle with drawn speed and turn rate, turned back at the edge of its square."""
         bound = self.scenario.obstacle_half_side
-        positions, headings = _unicycle(
-            self.obstacle_positions,
-            self.obstacle_headings,
-            self._walk_speeds[self.steps],
-            self._walk_turns[self.steps],
-            dt,
-        )
-        outside = (np.abs(positions) > bound).any(-1)
+        speeds, turn_rates = self._walk_speeds[self.steps], self._walk_turns[self.steps]
+        positions = _moved(self.obstacle_positions, _directions(self.obstacle_headings), speeds, dt)
+        headings = wrap_angle(self.obstacle_headings + turn_rates * dt)
+        outside = np.maximum(np.abs(positions[..., 0]), np.abs(positions[..., 1])) > bound
         self.obstacle_positions = np.clip(positions, -bound, bound)
         self.obstacle_headings = np.where(outside, wrap_angle(headings + np.pi), headings)
 
@@ -137,16 +153,16 @@ class World:
         return positions, headings, obstacles, obstacle_headings, waypoint
 
 
-def _unicycle(
-    positions: NDArray[np.float64],
-    headings: NDArray[np.float64],
-    speeds: NDArray[np.float64],
-    turn_rates: NDArray[np.float64],
-    dt: float,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The discrete unicycle: position first, with the old heading, then the heading (section III-A)."""
-    stride = (speeds * dt)[..., None] * np.stack((np.cos(headings), np.sin(headings)), axis=-1)
-    return positions + stride, wrap_angle(headings + turn_rates * dt)
+def _moved(
+    positions: NDArray[np.float64], directions: NDArray[np.float64], speeds: NDArray[np.float64], dt: float
+) -> NDArray[np.float64]:
+    """The discrete unicycle's position, which moves with the old heading (section III-A); the heading turns afterwards."""
+    return positions + (speeds * dt)[..., None] * directions
+
+
+def _directions(headings: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Cosine and sine, ``(..., 2)``."""
+    return np.stack((np.cos(headings), np.sin(headings)), axis=-1)
 
 
 def wrap_angle(angles: NDArray[np.float64]) -> NDArray[np.float64]:
