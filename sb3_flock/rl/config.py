@@ -44,7 +44,7 @@ class LearnerConfig(Settings):
     tau: float = Field(0.005, gt=0, le=1, description="update rate of the target networks (open)")
     n_steps: int = Field(1, ge=1, description="steps of the return in the critic's target (paper: 1)")
     train_freq: int = Field(1, ge=1, description="vector steps (one transition a vehicle) between rounds of updates")
-    update_ratio: float = Field(0.2, gt=0, description="updates for each transition flown (paper, Algorithm 1: 1)")
+    update_ratio: float = Field(0.4, gt=0, description="updates for each transition flown (paper, Algorithm 1: 1)")
     noise: float = Field(
         0.5, ge=0, description="standard deviation of the exploration noise at the start [half the action range] (open)"
     )
@@ -67,7 +67,7 @@ class PracticeConfig(Settings):
         0.5, gt=0, description="side of the obstacles' square, relative to the task's (ours; paper: 1)"
     )
     separation_ratio: float = Field(
-        1.1, ge=1, description="minimum separation to neighbors, relative to the task's (ours; paper: 1)"
+        1.08, ge=1, description="minimum separation to neighbors, relative to the task's (ours; paper: 1)"
     )
 
 

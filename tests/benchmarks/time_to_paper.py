@@ -26,15 +26,15 @@ def holds(means: dict[str, float], paper: dict[str, float]) -> bool:
     return all(means[name] >= bound if name.startswith("min_") else means[name] <= bound for name, bound in paper.items())
 
 
-def train_until_it_holds(n_vehicles: int, n_obstacles: int, seed: int) -> dict[str, object]:
-    """One training in this process."""
+def train_until_it_holds(n_vehicles: int, n_obstacles: int, seed: int, changes: list[str]) -> dict[str, object]:
+    """One training in this process; ``changes`` of the config as on the command line."""
     import numpy as np
     from rich.console import Console
     from stable_baselines3.common.callbacks import BaseCallback
 
     from sb3_flock import TrainingConfig, evaluate, load_policy, train
     from sb3_flock.evaluation.report import PAPER
-    from sb3_flock.rl.config_io import load_config
+    from sb3_flock.rl.config_io import load_config, parse_overrides
 
     paper = PAPER[n_vehicles, n_obstacles]["Table II"]
 
@@ -58,7 +58,7 @@ def train_until_it_holds(n_vehicles: int, n_obstacles: int, seed: int) -> dict[s
 
     with tempfile.TemporaryDirectory() as folder:
         overrides = {"n_vehicles": n_vehicles, "n_obstacles": n_obstacles, "seed": seed, "output_dir": folder}
-        config = load_config(TrainingConfig, overrides=overrides)
+        config = load_config(TrainingConfig, overrides={**overrides, **parse_overrides(changes)})
         stop = Stop()
         result = train(config, Console(quiet=True), callbacks=[stop])
         policy = result.model if stop.at is not None else load_policy(result.best_model)
@@ -74,15 +74,17 @@ def main() -> None:
     """Every training in a process of its own, one after the other."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="as for `sb3-flock train`")
     parser.add_argument("--one", type=int, nargs=3, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.one:
-        print(json.dumps(train_until_it_holds(*options.one)))
+        print(json.dumps(train_until_it_holds(*options.one, options.set)))
         return
     rows = []
     for setup in ((3, 1), (5, 2)):
         for seed in options.seeds:
-            words = [sys.executable, __file__, "--one", *map(str, (*setup, seed))]
+            changes = [f"--set={change}" for change in options.set]
+            words = [sys.executable, __file__, *changes, "--one", *map(str, (*setup, seed))]
             rows.append(json.loads(subprocess.run(words, check=True, stdout=subprocess.PIPE).stdout))
             print(json.dumps(rows[-1]), flush=True)
         minutes = [row["minutes"] or float("inf") for row in rows if (row["n_vehicles"], row["n_obstacles"]) == setup]
