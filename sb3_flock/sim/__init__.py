@@ -1,4 +1,4 @@
-"""The task itself: vehicles, obstacles, waypoint, what a vehicle senses and what it is paid for. NumPy only."""
+"""The task itself: vehicles, obstacles, waypoint, what a vehicle senses and what it is paid for. NumPy; numba where installed."""
 
 from sb3_flock.sim.observation import observe
 from sb3_flock.sim.reward import RewardWeights, mix_rewards, own_reward, reward_terms
