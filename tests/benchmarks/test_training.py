@@ -13,17 +13,11 @@ from sb3_flock import CompactReplayBuffer, FlockCNN, FlockDDPG, FlockPolicy, eva
 from sb3_flock.rl.algorithms import policy_kwargs
 from sb3_flock.rl.config import TrainingConfig
 from sb3_flock.rl.config_io import load_config
+from tests.rl.test_ddpg import PlainCNN
 
 POLICY = Path(__file__).parents[2] / "examples" / "policies" / "ddpg_5v2o.zip"
 CONFIG = load_config(TrainingConfig, overrides={"n_vehicles": 5, "n_obstacles": 2})
 UPDATES = 25
-
-
-class PlainCNN(FlockCNN):
-    """The same network in torch's own convolutions."""
-
-    def forward(self, observations):
-        return self.dense(self.cnn(observations))
 
 
 KINDS = {
