@@ -89,7 +89,8 @@ class Renderer:
         too_close = sensing.neighbors.count(scenario.neighbor_separation)[0] > 0
         hit = sensing.obstacles.count(scenario.obstacle_separation)[0] > 0
         for i, j in zip(sensing.neighbors.observers, sensing.neighbors.bodies, strict=True):
-            pygame.draw.aaline(canvas, _LINK, self._pixels(positions[i]), self._pixels(positions[j]))
+            if i < j:  # each link is seen from both ends
+                pygame.draw.aaline(canvas, _LINK, self._pixels(positions[i]), self._pixels(positions[j]))
         for obstacle in world.obstacle_positions[0]:
             pygame.draw.circle(canvas, _OBSTACLE, self._pixels(obstacle), 5)
             radius = scenario.obstacle_separation * self._scale

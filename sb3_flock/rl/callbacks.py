@@ -74,8 +74,7 @@ class NeighborInclusiveReward(BaseCallback):
     def mix(self, rewards: np.ndarray, infos: list[dict[str, Any]]) -> np.ndarray:
         """The mixed reward of every slot of the vector env, ``(slots,)``."""
         neighbors = [np.asarray(info.get("neighbors", ()), dtype=np.int64) for info in infos]
-        slots = np.arange(len(infos))
-        observers = np.repeat(slots, [len(found) for found in neighbors])
+        observers = np.repeat(np.arange(len(infos)), [len(found) for found in neighbors])
         first = observers - observers % self._agents_per_copy  # slot of the copy's first agent
         return mix_rewards(rewards, observers, first + np.concatenate(neighbors), self.lambda_)
 

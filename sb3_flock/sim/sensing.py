@@ -47,7 +47,7 @@ class Contacts:
 
     def sum(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """A value a contact, ``(contacts,)``, added up by observer: ``(flocks, vehicles)``."""
-        return np.bincount(self.observers, values, minlength=self._size).astype(np.float64).reshape(self.shape)
+        return np.bincount(self.observers, values, minlength=self._size).astype(np.float64, copy=False).reshape(self.shape)
 
     def by_observer(self) -> list[NDArray[np.int64]]:
         """The bodies that each vehicle senses, ascending; one array a vehicle."""

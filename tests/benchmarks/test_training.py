@@ -1,7 +1,6 @@
 """The speed of training and of evaluation, one core."""
 
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,9 +12,9 @@ from sb3_flock import CompactReplayBuffer, FlockCNN, FlockDDPG, FlockPolicy, eva
 from sb3_flock.rl.algorithms import policy_kwargs
 from sb3_flock.rl.config import TrainingConfig
 from sb3_flock.rl.config_io import load_config
+from tests.benchmarks.conftest import POLICY
 from tests.rl.test_ddpg import PlainCNN
 
-POLICY = Path(__file__).parents[2] / "examples" / "policies" / "ddpg_5v2o.zip"
 CONFIG = load_config(TrainingConfig, overrides={"n_vehicles": 5, "n_obstacles": 2})
 UPDATES = 25
 
