@@ -22,6 +22,7 @@ INTERRUPTED = 130
 _TRAIN_FLAGS = {
     "--n-vehicles": ("scenario.n_vehicles", "N"),
     "--n-obstacles": ("scenario.n_obstacles", "N"),
+    "--scenario": ("scenario.obstacle_motion", "NAME"),
     "--total-timesteps": ("total_timesteps", "N"),
     "--seed": ("seed", "N"),
     "--algo": ("algo", "NAME"),
@@ -32,6 +33,9 @@ _TRAIN_FLAGS = {
     "--save-freq": ("save_freq", "N"),
     "--init-from": ("init_from", "POLICY"),
 }
+
+_POLICY_HELP = "a zip, a run folder (its best_model.zip) or a shipped policy's name, such as paper-5v2o"
+_CONTROLLERS = ("random", "go-to-waypoint", "olfati-saber", "orca")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -67,6 +71,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     _add_train(commands)
     _add_evaluate(commands)
+    _add_reproduce(commands)
     _add_config(commands)
     return parser
 
@@ -152,7 +157,7 @@ def _train(options: argparse.Namespace, words: Sequence[str]) -> int:
 
     result = train(config, console, command=["sb3-flock", *words])
     policy = load_policy(result.best_model)
-    _evaluate_and_print(policy, config.scenario, config.test_episodes, seed=0, console=console)
+    _evaluate_and_print(policy, str(policy.path), config.scenario, config.test_episodes, seed=0, console=console)
     print(result.folder)
     return 0
 
@@ -167,9 +172,11 @@ def _add_evaluate(commands: Any) -> None:
         description="Fly a saved policy through many episodes at once and print every metric with its interval.",
         epilog="example: sb3-flock evaluate runs/ddpg_5v2o_1 --n-vehicles 8 --json result.json",
     )
-    parser.add_argument("policy", metavar="POLICY", help="a zip, or a run folder (its best_model.zip)")
+    parser.add_argument("policy", nargs="?", metavar="POLICY", help=_POLICY_HELP)
+    parser.add_argument("--controller", metavar="NAME", help=f"fly a hand-written law instead: {', '.join(_CONTROLLERS)}")
     parser.add_argument("--n-vehicles", dest="n_vehicles", metavar="N", help="number of vehicles [as trained]")
     parser.add_argument("--n-obstacles", dest="n_obstacles", metavar="N", help="number of obstacles [as trained]")
+    parser.add_argument("--scenario", dest="obstacle_motion", metavar="NAME", help="walk or crossing [as trained]")
     parser.add_argument("--episodes", type=_count(1), default=1000, metavar="N", help="episodes to fly [1000]")
     parser.add_argument("--seed", type=_count(0), default=0, metavar="N", help="seed of the episodes [0]")
     parser.add_argument("--device", default="cpu", metavar="NAME", help="torch device [cpu]")
@@ -195,28 +202,36 @@ def _evaluate(options: argparse.Namespace, words: Sequence[str]) -> int:
     from rich.console import Console
 
     from sb3_flock.rl.config_io import load_config, parse_overrides
-    from sb3_flock.rl.saving import load_policy
     from sb3_flock.sim import Scenario
 
+    if (options.policy is None) == (options.controller is None):
+        raise SettingsError("evaluate: a POLICY or --controller NAME is needed, and not both")
     if options.json is not None and not Path(options.json).absolute().parent.is_dir():
         raise SettingsError(f"--json {options.json}: there is no folder {Path(options.json).parent}")
-    policy = load_policy(options.policy, options.device)
+    flyer: Any
+    if options.policy is None:
+        from sb3_flock.evaluation.controllers import make_controller
+
+        flyer, name, trained_for = make_controller(options.controller), options.controller, Scenario()
+    else:
+        from sb3_flock.rl.saving import load_policy
+
+        flyer = load_policy(options.policy, options.device)
+        name, trained_for = str(flyer.path), flyer.scenario
     overrides = parse_overrides(options.set)
-    overrides.update({key: value for key in ("n_vehicles", "n_obstacles") if (value := getattr(options, key)) is not None})
-    scenario = load_config(Scenario, overrides=overrides, base=policy.scenario)
-    metrics = _evaluate_and_print(policy, scenario, options.episodes, options.seed, Console(stderr=True))
+    flags = ("n_vehicles", "n_obstacles", "obstacle_motion")
+    overrides.update({key: value for key in flags if (value := getattr(options, key)) is not None})
+    scenario = load_config(Scenario, overrides=overrides, base=trained_for)
+    metrics = _evaluate_and_print(flyer, name, scenario, options.episodes, options.seed, Console(stderr=True))
     if options.json is not None:
         from sb3_flock.evaluation.report import write_json
         from sb3_flock.rl.saving import versions
 
         meta = {
-            "policy": str(policy.path),
-            "algo": policy.config.algo,
-            "num_timesteps": policy.num_timesteps,
+            **({"controller": name} if options.policy is None else flyer.describe()),
             "episodes": options.episodes,
             "seed": options.seed,
             "scenario": scenario.model_dump(mode="json"),
-            "trained_with": policy.versions,
             "evaluated_with": versions(),
         }
         try:
@@ -226,7 +241,7 @@ def _evaluate(options: argparse.Namespace, words: Sequence[str]) -> int:
     return 0
 
 
-def _evaluate_and_print(policy: Any, scenario: Any, episodes: int, seed: int, console: Console) -> Any:
+def _evaluate_and_print(flyer: Any, name: str, scenario: Any, episodes: int, seed: int, console: Console) -> Any:
     import torch as th
     from rich.console import Console as RichConsole
 
@@ -236,13 +251,38 @@ def _evaluate_and_print(policy: Any, scenario: Any, episodes: int, seed: int, co
     th.set_num_threads(1)
     with warnings.catch_warnings(record=True) as caught, console.status(f"flying {episodes} episodes"):
         warnings.simplefilter("always", UserWarning)
-        metrics = evaluate(policy, scenario, episodes, seed)
+        metrics = evaluate(flyer, scenario, episodes, seed)
     for warning in caught:
         print(f"sb3-flock: warning: {warning.message}", file=sys.stderr)
-    print(f"{policy.path}:")
+    print(f"{name}:")
     print(f"{scenario.n_vehicles} vehicles, {scenario.n_obstacles} obstacles, {episodes} episodes, seed {seed}")
     RichConsole().print(metrics_table(metrics, scenario))
     return metrics
+
+
+# -- reproduce -------------------------------------------------------------------------------------------------------
+
+
+def _add_reproduce(commands: Any) -> None:
+    parser = commands.add_parser(
+        "reproduce",
+        help="make the paper's tables and figures with ours",
+        description="Fly the shipped policies and the hand-written laws; write the paper's tables and figures with ours.",
+        epilog="example: sb3-flock reproduce --quick --out results",
+    )
+    parser.add_argument("--out", default="results", metavar="DIR", help="folder to write to [results]")
+    parser.add_argument("--quick", action="store_true", help="100 episodes a row instead of 1000, the rest shortened alike")
+    parser.set_defaults(run=_reproduce)
+
+
+def _reproduce(options: argparse.Namespace, words: Sequence[str]) -> int:
+    import torch as th
+
+    from sb3_flock.reproduce import reproduce
+
+    th.set_num_threads(1)
+    print(reproduce(options.out, options.quick))
+    return 0
 
 
 # -- config ----------------------------------------------------------------------------------------------------------

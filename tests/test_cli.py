@@ -92,6 +92,16 @@ def test_evaluate_flies_another_number_of_vehicles_and_says_where_the_scenario_d
     assert "trained with link_range = 0.15, flown with 0.3" in capsys.readouterr().err
 
 
+def test_evaluate_flies_a_hand_written_law_too(tmp_path, capsys):
+    file = tmp_path / "result.json"
+    words = ["evaluate", "--controller", "olfati-saber", "--n-vehicles", "4", "--scenario", "crossing", "--episodes", "2"]
+    assert main([*words, "--json", str(file)]) == 0
+    assert "olfati-saber:\n4 vehicles, 1 obstacles" in capsys.readouterr().out
+    meta = json.loads(file.read_text())["meta"]
+    assert meta["controller"] == "olfati-saber"
+    assert meta["scenario"]["obstacle_motion"] == "crossing"
+
+
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
@@ -108,7 +118,10 @@ def test_evaluate_flies_another_number_of_vehicles_and_says_where_the_scenario_d
         (["train", "--output-dir", "/dev/null/x"], ["output_dir = /dev/null/x"]),
         (["train", "--n-vehicles", "400"], ["n_vehicles = 400", "no start"]),
         (["train", "--n-vehicle", "3"], ["unrecognized arguments"]),
-        (["evaluate"], ["POLICY"]),
+        (["evaluate"], ["POLICY or --controller NAME"]),
+        (["evaluate", "x.zip", "--controller", "orca"], ["not both"]),
+        (["evaluate", "--controller", "boids"], ["controller = 'boids'", "olfati-saber"]),
+        (["evaluate", "--controller", "random", "--scenario", "siege"], ["obstacle_motion = 'siege'", "crossing"]),
         (["evaluate", "no/such.zip"], ["no/such.zip", "no such file or run folder"]),
         (["evaluate", __file__], ["damaged or not a policy file"]),
         (["evaluate", os.path.dirname(__file__)], ["no best_model.zip"]),
@@ -137,7 +150,9 @@ def test_evaluates_mistakes_too(run_folder, extra, expected, capsys):
     fails(capsys, ["evaluate", str(run_folder), "--episodes", "2", *extra], *expected)
 
 
-@pytest.mark.parametrize("words", [["--help"], ["train", "--help"], ["evaluate", "--help"], ["config", "--help"]])
+@pytest.mark.parametrize(
+    "words", [["--help"], ["train", "--help"], ["evaluate", "--help"], ["reproduce", "--help"], ["config", "--help"]]
+)
 def test_help_fits_a_screen_and_gives_an_example(words, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     with pytest.raises(SystemExit) as stop:

@@ -20,7 +20,10 @@ only, a vehicle's action does not depend on how many others are computed beside 
 
 
 class Controller(Protocol):
-    """Whatever can fly vehicles: a learned policy or a hand-written law."""
+    """Whatever can fly vehicles: a learned policy or a hand-written law.
+
+    One that remembers or draws has a ``reset(rngs, scenario)``, too: episodes begin, one generator a flock.
+    """
 
     def act(self, sensing: Sensing, scenario: Scenario) -> NDArray[np.floating]:
         """The actions ``(flocks, vehicles, 2)`` [m/s, rad/s], each from what its own vehicle senses alone."""
@@ -65,7 +68,10 @@ def fly(
         numbers = range(start, min(start + batch, episodes))
         world = World(scenario, len(numbers))
         metrics = EpisodeMetrics(scenario, len(numbers))
-        sensing = world.reset([episode_rng(seed, episode) for episode in numbers])
+        rngs = [episode_rng(seed, episode) for episode in numbers]
+        sensing = world.reset(rngs)
+        if hasattr(controller, "reset"):
+            controller.reset(rngs, scenario)
         for _ in range(scenario.max_cycles):
             sensing, clipped = world.step(controller.act(sensing, scenario))
             metrics.update(world, sensing, own_reward(reward_terms(sensing, clipped, scenario)))

@@ -38,15 +38,15 @@ class LearnerConfig(Settings):
     learning_rate: float = Field(5e-4, gt=0, description="Adam's learning rate at the start (open)")
     final_learning_rate: float = Field(0.0, ge=0, description="learning rate at the end, reached linearly (open)")
     batch_size: int = Field(128, ge=1, description="transitions in a minibatch (open)")
-    buffer_size: int = Field(250_000, ge=1, description="transitions the shared replay buffer holds (open)")
+    buffer_size: int = Field(200_000, ge=1, description="transitions the shared replay buffer holds (open)")
     learning_starts: int = Field(4_000, ge=0, description="transitions flown with random actions before learning (open)")
-    gamma: float = Field(0.98, ge=0, lt=1, description="discount factor (open)")
+    gamma: float = Field(0.96, ge=0, lt=1, description="discount factor (open)")
     tau: float = Field(0.005, gt=0, le=1, description="update rate of the target networks (open)")
     n_steps: int = Field(1, ge=1, description="steps of the return in the critic's target (paper: 1)")
     train_freq: int = Field(1, ge=1, description="vector steps (one transition a vehicle) between rounds of updates")
     update_ratio: float = Field(0.4, gt=0, description="updates for each transition flown (paper, Algorithm 1: 1)")
     noise: float = Field(
-        0.5, ge=0, description="standard deviation of the exploration noise at the start [half the action range] (open)"
+        0.4, ge=0, description="standard deviation of the exploration noise at the start [half the action range] (open)"
     )
     final_noise: float = Field(0.05, ge=0, description="exploration noise at the end, reached linearly (open)")
 
@@ -56,19 +56,22 @@ class PracticeConfig(Settings):
 
     With the paper's walk an obstacle seldom meets the flock, and a policy that keeps exactly the minimum separation breaks it
     at the slightest error: practice is harder than the task. In a large flock everyone's exploration disturbs everyone, and
-    packs that are loose enough to bear it are what is learned: practice flies fewer vehicles.
+    packs that are loose enough to bear it are what is learned; in a small one too little happens: practice flies four. What
+    one action gains in a tenth of a second drowns in the noise of the values: practice decides less often. The learner's
+    gamma is for these longer steps.
     """
 
-    max_vehicles: int = Field(
-        4, ge=1, description="vehicles flown at most; the policy fits any number, and small flocks teach it sooner (ours)"
+    vehicles: Width | None = Field(
+        4, description="vehicles of a flock; null: the task's. The policy fits any number, and four teach it best (ours)"
     )
     extra_obstacles: int = Field(1, ge=0, description="obstacles added, where the task has any (ours; paper: 0)")
     obstacle_arena_ratio: float = Field(
         0.5, gt=0, description="side of the obstacles' square, relative to the task's (ours; paper: 1)"
     )
-    separation_ratio: float = Field(
-        1.08, ge=1, description="minimum separation to neighbors, relative to the task's (ours; paper: 1)"
+    time_step_ratio: float = Field(
+        2.0, gt=0, description="sampling period while training, relative to the task's (ours; paper: 1)"
     )
+    separation_ratio: float = Field(1.06, ge=1, description="minimum separations, relative to the task's (ours; paper: 1)")
 
 
 class TrainingConfig(Settings):
@@ -88,7 +91,7 @@ class TrainingConfig(Settings):
     network: NetworkConfig = Field(default_factory=NetworkConfig, description="the networks")
 
     total_timesteps: int = Field(250_000, ge=1, description="transitions to train for")
-    n_flocks: int = Field(8, ge=1, description="flocks flown side by side")
+    n_flocks: int = Field(32, ge=1, description="flocks flown side by side")
     num_cpus: int = Field(0, ge=0, description="SuperSuit worker processes; 0: fly in the training process (faster)")
     seed: int = Field(0, ge=0, le=2**32 - 1, description="seed of the networks, the noise and the flocks")
     device: str = Field("cpu", description="torch device: cpu, cuda, cuda:0, ... or auto")
@@ -107,8 +110,11 @@ class TrainingConfig(Settings):
         """The scenario flown while training: ``scenario`` changed as ``practice`` says."""
         scenario, practice = self.scenario, self.practice
         return scenario.replace(
-            n_vehicles=min(scenario.n_vehicles, practice.max_vehicles),
+            time_step=scenario.time_step * practice.time_step_ratio,
+            max_cycles=max(1, round(scenario.max_cycles / practice.time_step_ratio)),
+            n_vehicles=practice.vehicles or scenario.n_vehicles,
             n_obstacles=scenario.n_obstacles + (practice.extra_obstacles if scenario.n_obstacles else 0),
             obstacle_arena=scenario.obstacle_half_side * practice.obstacle_arena_ratio,
             neighbor_separation=min(scenario.neighbor_separation * practice.separation_ratio, scenario.link_range),
+            obstacle_separation=min(scenario.obstacle_separation * practice.separation_ratio, scenario.detection_range),
         )

@@ -36,6 +36,8 @@ MEMBER = "flock.json"
 FORMAT = 2
 """Version of the member's layout and of the networks' (2: the features are flattened anchor by anchor)."""
 PACKAGES = ("sb3_flock", "stable_baselines3", "torch", "gymnasium", "pettingzoo", "supersuit", "numpy")
+_EPISODE_STATE = ("_last_obs", "_last_original_obs", "_last_episode_starts")
+"""What SB3 would save of the episodes under way, as large as the networks; a loaded model resets its env before it learns."""
 
 
 class PolicyError(UserError):
@@ -56,6 +58,15 @@ class LoadedPolicy:
     def scenario(self) -> Scenario:
         """The task it was trained for."""
         return self.config.scenario
+
+    def describe(self) -> dict[str, Any]:
+        """What a result should tell of it, as plain values."""
+        return {
+            "policy": str(self.path),
+            "algo": self.config.algo,
+            "num_timesteps": self.num_timesteps,
+            "trained_with": self.versions,
+        }
 
     def check(self, scenario: Scenario) -> None:
         """Whether it can fly in a scenario. Warns where the same tensor or action means something else there.
@@ -95,7 +106,7 @@ def save_model(model: BaseAlgorithm, path: str | Path, config: TrainingConfig, o
     path = Path(path)
     aside = path.with_name(f".{path.name}.tmp")
     with open(aside, "wb") as file, nullcontext() if optimizers else _fresh_optimizers(model):
-        model.save(file)
+        model.save(file, exclude=_EPISODE_STATE)
     member = {
         "format": FORMAT,
         "config": config.model_dump(mode="json"),
@@ -135,19 +146,27 @@ def check_device(device: str) -> None:
         raise SettingsError(f"device = {device!r}: {_first_line(error)}") from None
 
 
+def shipped_policies() -> dict[str, Path]:
+    """The policies that come with the package, by name; beside each zip lies its model card."""
+    return {path.stem: path for path in sorted((Path(__file__).parents[1] / "policies").glob("*.zip"))}
+
+
 def find_policy(path: str | Path) -> Path:
-    """The zip that a path means: itself, or a run folder's best (else final) model.
+    """The zip that a path means: itself, a run folder's best (else final) model, or a shipped policy by name.
 
     :raises PolicyError: if there is none
     """
+    shipped = shipped_policies().get(str(path))
     path = Path(path)
+    if shipped is not None and not path.exists():
+        return shipped
     if path.is_dir():
         for name in ("best_model.zip", "final_model.zip"):
             if (path / name).is_file():
                 return path / name
         raise PolicyError(f"{path}: no best_model.zip or final_model.zip in this folder")
     if not path.is_file():
-        raise PolicyError(f"{path}: no such file or run folder")
+        raise PolicyError(f"{path}: no such file or run folder, nor one of {', '.join(shipped_policies())}")
     return path
 
 

@@ -3,10 +3,11 @@
 from sb3_flock.sim.observation import observe
 from sb3_flock.sim.reward import RewardWeights, mix_rewards, own_reward, reward_terms
 from sb3_flock.sim.scenario import Scenario
-from sb3_flock.sim.sensing import Sensing, sense
+from sb3_flock.sim.sensing import Contacts, Sensing, sense
 from sb3_flock.sim.world import World, episode_rng
 
 __all__ = [
+    "Contacts",
     "RewardWeights",
     "Scenario",
     "Sensing",

@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 _CHUNK = 64
 """Bodies whose factors are computed side by side."""
 
+_SERIES = tuple(1 / math.factorial(k) for k in range(9, -1, -1))
+"""Coefficients of the exponential's series."""
+
 
 @njit(cache=True)
 def find_contacts(
@@ -80,14 +83,16 @@ def paint(
                 factors[b] = along_y[b, i]
             if observer == last:
                 for a in range(side):
+                    factor = along_x[a, i]
                     for b in range(side):
-                        plane[a, b] += along_x[a, i] * factors[b]
+                        plane[a, b] += factor * factors[b]
             else:
                 for blank in range(last + 1, observer):
                     tensor[blank, channel] = 0
                 for a in range(side):
+                    factor = along_x[a, i]
                     for b in range(side):
-                        plane[a, b] = along_x[a, i] * factors[b]
+                        plane[a, b] = factor * factors[b]
                 last = observer
     for blank in range(last + 1, len(tensor)):
         tensor[blank, channel] = 0
@@ -103,8 +108,9 @@ def _gaussians(out: NDArray[np.float32], x: NDArray[np.float64], step: float, ro
     shrink = math.exp(-step * step)
     values, ratios = np.empty(_CHUNK), np.empty(_CHUNK)
     for i in range(_CHUNK):
-        values[i] = math.exp(-0.5 * (x[i] * step) ** 2)
-        ratios[i] = math.exp(step * step * (x[i] - 0.5))
+        values[i] = _exp(-0.5 * (x[i] * step) ** 2)
+    for i in range(_CHUNK):
+        ratios[i] = _exp(step * step * (x[i] - 0.5))
     for anchor in range(len(row)):
         for i in range(_CHUNK):
             out[anchor, i] = values[i]
@@ -112,3 +118,18 @@ def _gaussians(out: NDArray[np.float32], x: NDArray[np.float64], step: float, ro
             values[i] *= ratios[i]
         for i in range(_CHUNK):
             ratios[i] *= shrink
+
+
+@njit(error_model="numpy", inline="always")
+def _exp(t: float) -> float:
+    """exp(t): that of t / 1024 by its series, squared ten times. The compiler does several at once, unlike the library's.
+
+    Relative error: 1e-13 up to 100 either way, 1e-9 at 300, 3e-7 at -500, where all is 0 in single precision.
+    """
+    u = t / 1024
+    power = 0.0
+    for term in _SERIES:
+        power = power * u + term
+    for _ in range(10):
+        power *= power
+    return power

@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 class RewardWeights(Settings):
     """The weights of the reward. Those the paper does not name are 1, its plain sum, in ``configs/paper_plain.yaml``."""
 
-    link_bonus: float = Field(1.0, ge=0, description="reward for each neighbor at a safe distance (paper, IV-B: 1)")
+    link_bonus: float = Field(0.5, ge=0, description="reward for each neighbor at a safe distance (paper, IV-B: 1)")
     separation_penalty: float = Field(
-        4.0, ge=0, description="penalty for each neighbor nearer than neighbor_separation (paper, IV-B: 1)"
+        6.0, ge=0, description="penalty for each neighbor nearer than neighbor_separation (paper, IV-B: 1)"
     )
     obstacle_penalty: float = Field(
-        3.0, ge=0, description="penalty for each obstacle nearer than obstacle_separation (paper, IV-B: 1)"
+        12.0, ge=0, description="penalty for each obstacle nearer than obstacle_separation (paper, IV-B: 1)"
     )
     epsilon: float = Field(10.0, ge=0, description="weight of the distance to the waypoint [1/m] (paper leaves it open)")
     beta: float = Field(

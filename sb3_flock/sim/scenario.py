@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Literal
 
 from pydantic import Field, model_validator
 
@@ -35,6 +36,11 @@ class Scenario(Settings):
     )
     waypoint_speed: float = Field(0.1, ge=0, description="speed of the waypoint towards the origin [m/s] (paper, V)")
 
+    obstacle_motion: Literal["walk", "crossing"] = Field(
+        "walk",
+        description="walk: at random (paper, V); crossing: straight through the flock from its far side (ours)",
+    )
+
     arena: float = Field(1.0, gt=0, description="half side of the square in which all bodies start [m] (paper, V)")
     obstacle_arena: float | None = Field(
         None, gt=0, description="half side of the square in which obstacles start and walk [m]; null: arena (paper, V)"
@@ -52,7 +58,7 @@ class Scenario(Settings):
         None, gt=0, description="half width of the obstacle channel [m]; null: detection_range (paper, IV-A)"
     )
     goal_radius: float = Field(
-        0.4, gt=0, description="half width r_g of the goal channel [m]; a farther waypoint shows on its circle (open)"
+        0.3, gt=0, description="half width r_g of the goal channel [m]; a farther waypoint shows on its circle (open)"
     )
     anchor_width: float = Field(
         1.0, ge=0.1, description="standard deviation sigma of the anchors' Gaussian [anchor spacings] (open)"

@@ -42,7 +42,8 @@ class Contacts:
 
     def count(self, closer_than: float = np.inf) -> NDArray[np.int64]:
         """How many bodies each vehicle senses nearer than a distance [m] (strictly); ``(flocks, vehicles)``."""
-        counts: NDArray[np.int64] = np.bincount(self.observers[self.distances < closer_than], minlength=self._size)
+        near = self.observers if closer_than == np.inf else self.observers[self.distances < closer_than]
+        counts: NDArray[np.int64] = np.bincount(near, minlength=self._size)
         return counts.reshape(self.shape)
 
     def sum(self, values: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 
 _MAX_REDRAWS = 1000
 """Draws allowed for one body's start before the arena counts as too crowded."""
+
+_SLOWEST_CROSSING = 0.6
+"""Slowest crossing obstacle [top speeds]: from the arena's edge to the origin in 100 to 167 steps, when the flock is there."""
 
 
 class WorldError(UserError):
@@ -96,12 +99,9 @@ class World:
         self.positions, self.headings, self.obstacle_positions, self.obstacle_headings, self.waypoints = (
             np.stack(parts) for parts in zip(*starts, strict=True)
         )
-        walk_shape = (scenario.max_cycles, scenario.n_obstacles)
-        walks = [
-            (rng.uniform(0.0, scenario.obstacle_max_speed, walk_shape), rng.normal(0.0, 1.0, walk_shape)) for rng in rngs
-        ]
-        self._walk_speeds = np.stack([speeds for speeds, _ in walks], axis=1)
-        self._walk_turns = np.stack([turns for _, turns in walks], axis=1) * scenario.obstacle_turn_std
+        courses = [self._course(rng) for rng in rngs]
+        self._obstacle_speeds = np.stack([speeds for speeds, _ in courses], axis=1)
+        self._obstacle_turns = np.stack([turns for _, turns in courses], axis=1) * scenario.obstacle_turn_std
         self.steps = 0
         return sense(self)
 
@@ -127,14 +127,13 @@ class World:
         return sense(self), clipped
 
     def _move_obstacles(self, dt: float) -> None:
-        """The random walk: a unicycle with drawn speed and turn rate, turned back at the edge of its square."""
+        """Unicycles with drawn speeds and turn rates, turned back at the edge of their square."""
         bound = self.scenario.obstacle_half_side
-        speeds, turn_rates = self._walk_speeds[self.steps], self._walk_turns[self.steps]
+        speeds, turn_rates = self._obstacle_speeds[self.steps], self._obstacle_turns[self.steps]
         positions = _moved(self.obstacle_positions, _directions(self.obstacle_headings), speeds, dt)
-        headings = wrap_angle(self.obstacle_headings + turn_rates * dt)
         outside = np.maximum(np.abs(positions[..., 0]), np.abs(positions[..., 1])) > bound
         self.obstacle_positions = np.clip(positions, -bound, bound)
-        self.obstacle_headings = np.where(outside, wrap_angle(headings + np.pi), headings)
+        self.obstacle_headings = wrap_angle(self.obstacle_headings + turn_rates * dt + np.pi * outside)
 
     def _start(self, rng: Generator) -> tuple[NDArray[np.float64], ...]:
         scenario = self.scenario
@@ -144,6 +143,10 @@ class World:
             positions[i] = placed.draw_apart(rng, scenario.arena, "n_vehicles", scenario.n_vehicles)
             placed.add(*positions[i].tolist())
         placed = _Placed(scenario.obstacle_separation, positions.tolist())
+        if scenario.obstacle_motion == "crossing":
+            headings = rng.uniform(-np.pi, np.pi, scenario.n_vehicles)
+            waypoint = rng.uniform(-scenario.arena, scenario.arena, 2)
+            return positions, headings, *self._far_side(rng, placed, waypoint), waypoint
         obstacles = np.empty((scenario.n_obstacles, 2))
         for o in range(scenario.n_obstacles):
             obstacles[o] = placed.draw_apart(rng, scenario.obstacle_half_side, "n_obstacles", scenario.n_obstacles)
@@ -151,6 +154,31 @@ class World:
         obstacle_headings = rng.uniform(-np.pi, np.pi, scenario.n_obstacles)
         waypoint = rng.uniform(-scenario.arena, scenario.arena, 2)
         return positions, headings, obstacles, obstacle_headings, waypoint
+
+    def _far_side(
+        self, rng: Generator, placed: _Placed, waypoint: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Starts and headings of crossing obstacles: opposite the waypoint, aimed at where the flock will be."""
+        scenario, count = self.scenario, self.scenario.n_obstacles
+        radius, behind = scenario.obstacle_half_side, math.atan2(-waypoint[1], -waypoint[0])
+
+        def point() -> NDArray[np.float64]:
+            angle = behind + rng.uniform(-np.pi / 4, np.pi / 4)
+            return radius * np.array([math.cos(angle), math.sin(angle)])
+
+        starts = np.empty((count, 2))
+        for o in range(count):
+            starts[o] = placed.draw(point, f"a quarter of a circle of radius {radius} m", "n_obstacles", count)
+        aims = rng.uniform(-scenario.link_range, scenario.link_range, (count, 2)) - starts
+        return starts, np.arctan2(aims[:, 1], aims[:, 0])
+
+    def _course(self, rng: Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """An episode's speeds [m/s] and turn rates [standard deviations] of the obstacles, each ``(steps, obstacles)``."""
+        shape = (self.scenario.max_cycles, self.scenario.n_obstacles)
+        top = self.scenario.obstacle_max_speed
+        if self.scenario.obstacle_motion == "crossing":
+            return np.broadcast_to(rng.uniform(_SLOWEST_CROSSING * top, top, shape[1]), shape), np.zeros(shape)
+        return rng.uniform(0.0, top, shape), rng.normal(0.0, 1.0, shape)
 
 
 def _moved(
@@ -186,13 +214,17 @@ class _Placed:
 
     def draw_apart(self, rng: Generator, half_side: float, name: str, count: int) -> NDArray[np.float64]:
         """A point uniform in the square, drawn again while it is closer than the separation to a vehicle."""
+        return self.draw(lambda: rng.uniform(-half_side, half_side, 2), f"a square of half side {half_side} m", name, count)
+
+    def draw(self, point_of: Callable[[], NDArray[np.float64]], where: str, name: str, count: int) -> NDArray[np.float64]:
+        """A point that a function draws, drawn again while it is closer than the separation to a vehicle."""
         for _ in range(_MAX_REDRAWS):
-            point = rng.uniform(-half_side, half_side, 2)
+            point = point_of()
             if self._is_free(*point.tolist()):
                 return point
         raise WorldError(
             f"{name} = {count}: no start at least {self.separation} m from the vehicles found in {_MAX_REDRAWS} draws "
-            f"from a square of half side {half_side} m; fewer bodies or a larger arena are needed"
+            f"from {where}; fewer bodies or a larger arena are needed"
         )
 
     def _is_free(self, x: float, y: float) -> bool:

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 PEERS = Path(__file__).parent / "peers"
-POLICY = Path(__file__).parents[2] / "examples" / "policies" / "ddpg_5v2o.zip"
-"""The policy whose flocks are measured."""
+POLICY = "paper-5v2o"
+"""The shipped policy whose flocks are measured."""
 
 
 @pytest.fixture

@@ -122,7 +122,7 @@ def test_peers_in_training(benchmark, peer, tmp_path, name):
     seconds, updates = [], []
     config = CONFIG.replace(
         total_timesteps=16_000, output_dir=str(tmp_path), eval_freq=0, save_freq=0,
-        practice=CONFIG.practice.replace(max_vehicles=5),
+        practice=CONFIG.practice.replace(vehicles=5),
         learner=CONFIG.learner.replace(learning_starts=200),
     )  # fmt: skip
 

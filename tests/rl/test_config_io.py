@@ -73,21 +73,31 @@ def test_a_wrong_override_is_one_line(assignment):
         parse_overrides([assignment])
 
 
-def test_practice_flies_fewer_vehicles_but_never_more():
-    for n_vehicles, flown in ((2, 2), (3, 3), (9, 3)):
-        config = load_config(TrainingConfig, overrides={"n_vehicles": n_vehicles, "max_vehicles": 3})
+def test_practice_flies_its_own_number_of_vehicles_or_the_tasks():
+    for vehicles, flown in ((3, 3), (9, 9), (None, 5)):
+        config = load_config(TrainingConfig, overrides={"n_vehicles": 5, "practice.vehicles": vehicles})
         assert config.flown_scenario().n_vehicles == flown
-        assert config.scenario.n_vehicles == n_vehicles
+        assert config.scenario.n_vehicles == 5
 
 
 def test_practice_is_harder_than_the_task_and_scales_with_it():
     overrides = {"n_obstacles": 1, "obstacle_arena": 40.0, "neighbor_separation": 2.0, "link_range": 2.04}
+    overrides |= {"obstacle_separation": 3.0, "detection_range": 5.0}
     config = load_config(TrainingConfig, overrides={**overrides, "extra_obstacles": 3, "separation_ratio": 1.1})
     flown = config.flown_scenario()
     assert (flown.n_obstacles, flown.obstacle_arena, flown.neighbor_separation) == (4, 20.0, 2.04)
+    assert flown.obstacle_separation == pytest.approx(3.3)
     assert config.scenario.n_obstacles == 1
     none = load_config(TrainingConfig, overrides={"n_obstacles": 0, "extra_obstacles": 3})
     assert none.flown_scenario().n_obstacles == 0
+
+
+def test_practice_takes_longer_steps_for_the_same_time():
+    config = load_config(TrainingConfig, overrides={"max_cycles": 200, "time_step": 0.1, "time_step_ratio": 2.5})
+    flown = config.flown_scenario()
+    assert (flown.max_cycles, flown.time_step) == (80, 0.25)
+    shortest = load_config(TrainingConfig, overrides={"max_cycles": 1, "time_step_ratio": 10})
+    assert shortest.flown_scenario().max_cycles == 1
 
 
 def test_yaml_is_plain():

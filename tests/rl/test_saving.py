@@ -60,6 +60,18 @@ def test_without_what_the_optimizers_gathered_a_file_is_small_flies_the_same_and
     assert loaded.actor.optimizer.state
 
 
+def test_a_file_does_not_grow_with_the_flocks_that_were_under_way(tmp_path):
+    sizes = []
+    for n_flocks in (1, 32):
+        model = build_model(CONFIG, make_vec_env(CONFIG.scenario, n_flocks, seed=0))
+        model.learn(1)
+        sizes.append(save_model(model, tmp_path / "policy.zip", CONFIG).stat().st_size)
+    assert sizes[1] < sizes[0] + 20_000
+    again = FlockDDPG.load(tmp_path / "policy.zip", make_vec_env(CONFIG.scenario, 32, seed=0), device="cpu")
+    again.learn(2 * again.n_envs, reset_num_timesteps=False)
+    assert again.num_timesteps >= 3 * again.n_envs
+
+
 def test_a_run_folder_means_its_best_model_else_its_final(saved, tmp_path):
     run = tmp_path / "run"
     run.mkdir()

@@ -20,6 +20,7 @@ from sb3_flock.settings import UserError
 TINY = {
     "total_timesteps": 300, "n_flocks": 2, "eval_freq": 120, "eval_episodes": 2, "save_freq": 150, "max_cycles": 20,
     "learning_starts": 60, "buffer_size": 1000, "batch_size": 16, "update_ratio": 0.34, "features_dim": 16, "net_arch": [16],
+    "practice.vehicles": 3,
 }  # fmt: skip
 
 
@@ -188,7 +189,7 @@ def test_workers_train_too(tmp_path):
         ({"output_dir": "/dev/null/runs"}, "output_dir = /dev/null/runs"),
         ({"n_anchors": 5}, "do not fit a tensor of"),
         ({"buffer_size": 10**12}, "buffer_size = 1000000000000"),
-        ({"n_vehicles": 500, "max_vehicles": 500}, "n_vehicles = 500"),
+        ({"n_vehicles": 500}, "n_vehicles = 500"),
     ],
 )
 def test_what_cannot_be_used_is_told_in_one_line(changes, message, tmp_path):

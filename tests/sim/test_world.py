@@ -44,21 +44,42 @@ def test_a_waypoint_on_the_origin_or_without_speed_stays(scenario, place):
 def test_an_obstacle_walks_as_a_unicycle_and_turns_back_at_the_edge(scenario, place):
     world = place(scenario, [(0.0, 0.0)], [0.0], obstacles=[(0.0, 0.5), (0.999, 0.0)])
     world.obstacle_headings = np.array([[np.pi / 2, 0.0]])
-    world._walk_speeds[0] = [[0.05, 0.1]]
-    world._walk_turns[0] = [[1.0, 0.5]]
+    world._obstacle_speeds[0] = [[0.05, 0.1]]
+    world._obstacle_turns[0] = [[1.0, 0.5]]
     world.step(np.zeros((1, 1, 2)))
     np.testing.assert_allclose(world.obstacle_positions[0], [(0.0, 0.505), (1.0, 0.0)], atol=1e-12)
     np.testing.assert_allclose(world.obstacle_headings[0], [np.pi / 2 + 0.1, 0.05 - np.pi], atol=1e-12)
+
+
+def test_crossing_obstacles_start_behind_the_flocks_way_and_walk_straight_through_its_end():
+    scenario = Scenario(n_vehicles=5, n_obstacles=4, obstacle_motion="crossing")
+    world = World(scenario, 50)
+    world.reset([episode_rng(2, e) for e in range(50)])
+    starts, waypoints = world.obstacle_positions, world.waypoints[:, None]
+    np.testing.assert_allclose(np.linalg.norm(starts, axis=-1), 1.0)
+    cosines = -(starts * waypoints).sum(-1) / np.linalg.norm(waypoints, axis=-1)
+    assert (cosines >= np.cos(np.pi / 4) - 1e-12).all()
+    assert nearest(world.positions, world.obstacle_positions).min() >= scenario.obstacle_separation
+    headings, closest, arrival = world.obstacle_headings, np.full((50, 4), np.inf), np.zeros((50, 4))
+    for k in range(170):
+        world.step(np.zeros((50, 5, 2)))
+        np.testing.assert_allclose(world.obstacle_headings, headings, atol=1e-12)
+        distance = np.linalg.norm(world.obstacle_positions, axis=-1)
+        arrival[distance < closest] = k
+        closest = np.minimum(closest, distance)
+    assert closest.max() <= np.sqrt(2) * scenario.link_range
+    assert arrival.min() >= 75  # a chord that misses the origin is shorter than the way to it
+    assert arrival.max() < 169
 
 
 def test_the_walk_has_the_stated_distribution():
     scenario = Scenario(n_vehicles=1, n_obstacles=50)
     world = World(scenario, 20)
     world.reset([episode_rng(1, e) for e in range(20)])
-    assert world._walk_speeds.min() >= 0
-    assert world._walk_speeds.max() <= scenario.obstacle_max_speed
-    assert world._walk_speeds.mean() == pytest.approx(0.05, rel=0.01)
-    assert world._walk_turns.std() == pytest.approx(2.0, rel=0.01)
+    assert world._obstacle_speeds.min() >= 0
+    assert world._obstacle_speeds.max() <= scenario.obstacle_max_speed
+    assert world._obstacle_speeds.mean() == pytest.approx(0.05, rel=0.01)
+    assert world._obstacle_turns.std() == pytest.approx(2.0, rel=0.01)
 
 
 @settings(max_examples=30, deadline=None)

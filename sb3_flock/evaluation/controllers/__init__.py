@@ -1,0 +1,29 @@
+"""Hand-written controllers behind the interface of a policy: ``evaluate(make_controller("orca"), scenario)``."""
+
+from __future__ import annotations
+
+from sb3_flock.evaluation.controllers.olfati_saber import OlfatiSaber
+from sb3_flock.evaluation.controllers.orca import Orca
+from sb3_flock.evaluation.controllers.simple import GoToWaypoint, RandomController
+from sb3_flock.evaluation.episodes import Controller
+from sb3_flock.settings import SettingsError
+
+CONTROLLERS: dict[str, type[Controller]] = {
+    "random": RandomController,
+    "go-to-waypoint": GoToWaypoint,
+    "olfati-saber": OlfatiSaber,
+    "orca": Orca,
+}
+"""The controllers by name."""
+
+__all__ = ["CONTROLLERS", "GoToWaypoint", "OlfatiSaber", "Orca", "RandomController", "make_controller"]
+
+
+def make_controller(name: str) -> Controller:
+    """A controller by its name.
+
+    :raises SettingsError: for an unknown name, or if its library is not installed
+    """
+    if name not in CONTROLLERS:
+        raise SettingsError(f"controller = {name!r}: one of {', '.join(CONTROLLERS)} is needed")
+    return CONTROLLERS[name]()

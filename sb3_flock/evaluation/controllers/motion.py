@@ -1,0 +1,74 @@
+"""What the laws share: planar velocities for a unicycle, and velocities from two looks at the same bodies."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_flock.sim import Contacts, Scenario
+
+
+def steer(velocities: NDArray[np.float64], scenario: Scenario) -> NDArray[np.float64]:
+    """A unicycle's actions for wanted velocities: turn towards it, drive as much of it as points ahead.
+
+    :param velocities: ``(..., 2)`` [m/s], in the body frame: forward is +x
+    :return: ``(..., 2)``: speed [m/s] and turn rate [rad/s], within their bounds
+    """
+    forward, left = velocities[..., 0], velocities[..., 1]
+    moving = np.hypot(forward, left) > 1e-3 * scenario.max_speed  # a wish too small to tell its direction
+    turn_rates = np.where(moving, np.arctan2(left, forward) / scenario.time_step, 0.0)
+    return np.stack(
+        (
+            np.clip(forward, 0.0, scenario.max_speed),
+            np.clip(turn_rates, -scenario.max_turn_rate, scenario.max_turn_rate),
+        ),
+        axis=-1,
+    )
+
+
+def limit(velocities: NDArray[np.float64], speed: float) -> NDArray[np.float64]:
+    """The velocities ``(..., 2)``, shortened to a speed where they exceed it."""
+    return (
+        velocities * np.minimum(1.0, speed / np.maximum(np.hypot(velocities[..., 0], velocities[..., 1]), 1e-12))[..., None]
+    )
+
+
+def rotate(vectors: NDArray[np.float64], angles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Vectors ``(..., 2)`` turned by angles ``(...)`` [rad]."""
+    cos, sin = np.cos(angles), np.sin(angles)
+    x, y = vectors[..., 0], vectors[..., 1]
+    return np.stack((cos * x - sin * y, sin * x + cos * y), axis=-1)
+
+
+class Velocities:
+    """Velocities of sensed bodies, from where they are and where they were one step ago.
+
+    A vehicle remembers one look and its own last action, nothing that others tell it. A body seen for the first time counts
+    as standing.
+    """
+
+    def __init__(self) -> None:
+        self._keys = np.empty(0, np.int64)
+        self._positions = np.empty((0, 2))
+
+    def update(self, contacts: Contacts, n_bodies: int, actions: NDArray[np.float64], dt: float) -> NDArray[np.float64]:
+        """The velocity of each sensed body.
+
+        :param contacts: who senses whom, now
+        :param n_bodies: bodies in a flock
+        :param actions: ``(flocks, vehicles, 2)``, flown since the last look
+        :param dt: time since the last look [s]
+        :return: ``(contacts, 2)`` [m/s], over ground, in the observers' frames of now
+        """
+        keys = contacts.observers * n_bodies + contacts.bodies  # ascending, as the contacts are
+        at = np.searchsorted(self._keys, keys)
+        known = np.zeros(len(keys), bool)
+        within = at < len(self._keys)
+        known[within] = self._keys[at[within]] == keys[within]
+        velocities = np.zeros((len(keys), 2))
+        speeds, turn_rates = actions.reshape(-1, 2)[contacts.observers[known]].T
+        driven = np.stack((speeds * dt, np.zeros_like(speeds)), axis=-1)
+        before = rotate(self._positions[at[known]] - driven, -turn_rates * dt)
+        velocities[known] = (contacts.positions[known] - before) / dt
+        self._keys, self._positions = keys, contacts.positions
+        return velocities

@@ -1,0 +1,73 @@
+"""Model cards: what is on record of a shipped policy, as JSON beside its zip."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sb3_flock.evaluation.episodes import evaluate
+from sb3_flock.rl.saving import load_policy, shipped_policies
+
+CHECK_EPISODES, CHECK_SEED = 50, 7
+"""The short flight whose tracking error a card keeps, to tell whether the policy still flies as it did."""
+
+
+def read_card(name: str) -> dict[str, Any]:
+    """The card of a shipped policy: how its trainings were run, their curves and their results."""
+    card: dict[str, Any] = json.loads(shipped_policies()[name].with_suffix(".json").read_text(encoding="utf-8"))
+    return card
+
+
+def median_of_seeds(card: dict[str, Any]) -> dict[str, float]:
+    """The median over the trainings of each metric on record."""
+    seeds = [seed["metrics"] for seed in card["seeds"]]
+    return {
+        name: float(np.median([metrics[name] for metrics in seeds])) for name in seeds[0] if None not in seeds[0].values()
+    }
+
+
+def ship(name: str, runs: Sequence[str | Path], folder: str | Path, episodes: int = 1000) -> Path:
+    """Make ``<name>.zip`` and ``<name>.json`` from trainings that differ by their seed: the best one's policy, and all results.
+
+    The best is chosen by the evaluations during training; the results are of episodes that no training saw.
+
+    :param runs: run folders of finished trainings
+    :return: the path of the zip
+    """
+    folder, records, best = Path(folder), [], (np.inf, Path())
+    for run in map(Path, runs):
+        policy = load_policy(run)
+        history = np.load(run / "evaluations.npz")
+        metrics = evaluate(policy, episodes=episodes, seed=0)
+        records.append(
+            {
+                "seed": policy.config.seed,
+                "command": (run / "command.txt").read_text(encoding="utf-8").strip(),
+                "transitions": int(history["timesteps"][-1]),
+                "minutes": round(float(history["seconds"][-1]) / 60, 1),
+                "metrics": {key: None if metric.mean is None else round(metric.mean, 5) for key, metric in metrics.items()},
+                "curve": {key: history[key].round(4).tolist() for key in ("timesteps", "return", "tracking_error")},
+            }
+        )
+        best = min(best, (float(history["score"].min()), run))
+    shipped = load_policy(best[1])
+    shutil.copyfile(shipped.path, folder / f"{name}.zip")
+    check = evaluate(shipped, episodes=CHECK_EPISODES, seed=CHECK_SEED)["tracking_error"].mean
+    scenario = shipped.scenario
+    card = {
+        "name": name,
+        "task": f"{scenario.n_vehicles} vehicles, {scenario.n_obstacles} obstacles ({scenario.obstacle_motion})",
+        "shipped_seed": shipped.config.seed,
+        "episodes": episodes,
+        "check": {"episodes": CHECK_EPISODES, "seed": CHECK_SEED, "tracking_error": check},
+        "versions": shipped.versions,
+        "seeds": records,
+        "config": shipped.config.model_dump(mode="json"),
+    }
+    (folder / f"{name}.json").write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
+    return folder / f"{name}.zip"

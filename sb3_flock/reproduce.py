@@ -1,0 +1,275 @@
+"""The paper's tables and figures, ours beside theirs, in one folder (``sb3-flock reproduce``)."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from sb3_flock.envs.vec_env import make_vec_env
+from sb3_flock.evaluation.controllers import CONTROLLERS, make_controller
+from sb3_flock.evaluation.episodes import PolicyController, evaluate
+from sb3_flock.evaluation.figures import check_matplotlib, lines, observation, record, save, trajectories
+from sb3_flock.evaluation.metrics import Metric
+from sb3_flock.evaluation.model_cards import median_of_seeds, read_card
+from sb3_flock.evaluation.report import PAPER
+from sb3_flock.rl.algorithms import build_model
+from sb3_flock.rl.callbacks import NeighborInclusiveReward
+from sb3_flock.rl.config import TrainingConfig
+from sb3_flock.rl.saving import LoadedPolicy, load_policy, shipped_policies, versions
+from sb3_flock.settings import SettingsError
+from sb3_flock.sim import Scenario
+
+SETTINGS = {"paper-3v1o": (3, 1), "paper-5v1o": (5, 1), "paper-5v2o": (5, 2)}
+"""The paper's experiments: the shipped policy's name, its vehicles and obstacles."""
+
+FLEETS = (1, 2, 3, 5, 8, 12, 20, 50, 200)
+"""Vehicles that the general policy is flown with."""
+
+_MOST_IN_THE_ARENA = 50
+"""Vehicles that start in the paper's arena and leave room for obstacles."""
+
+COLUMNS = {
+    "tracking error": "tracking_error",
+    "min. sep. obstacles": "min_separation_obstacles",
+    "... in encounters": "encounter_min_separation_obstacles",
+    "min. sep. neighbors": "min_separation_neighbors",
+    "mean separation": "mean_separation",
+    "too close to a neighbor": "neighbor_violation_rate",
+    "... to an obstacle": "obstacle_violation_rate",
+    "connected": "connectivity",
+}
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much is flown and measured."""
+
+    episodes: int
+    fleet_episodes: int
+    timed_steps: int
+
+
+FULL, QUICK = Size(1000, 200, 100), Size(100, 20, 20)
+
+
+def reproduce(out: str | Path, quick: bool = False, console: Console | None = None) -> Path:
+    """Fly the shipped policies and the hand-written controllers; write every table and figure of the paper with ours.
+
+    :param out: folder for ``results.md``, ``tables.json`` and the figures as PNG and SVG
+    :param quick: 100 episodes instead of 1000, and the other measurements shortened alike
+    :return: the path of ``results.md``
+    :raises SettingsError: if matplotlib is missing or the folder cannot be written
+    """
+    check_matplotlib()
+    size, console = QUICK if quick else FULL, console or Console(stderr=True)
+    folder = Path(out)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SettingsError(f"--out {out}: {error.strerror or error}") from None
+    policies = {name: load_policy(name) for name in shipped_policies()}
+    parts = [_head(size)]
+    with console.status("") as status:
+        tables: dict[str, Any] = {}
+        for name, setup in SETTINGS.items():
+            status.update(f"{setup[0]} vehicles, {setup[1]} obstacles: {size.episodes} episodes of each controller")
+            tables[name] = _fly_all(policies[name], Scenario(n_vehicles=setup[0], n_obstacles=setup[1]), size.episodes)
+        parts.append(_tables(tables))
+        status.update("a hard test: crossing obstacles")
+        crossing = Scenario(n_vehicles=5, n_obstacles=2, obstacle_motion="crossing")
+        parts.append(_crossing(_fly_all(policies["paper-5v2o"], crossing, size.episodes)))
+        status.update("figures")
+        parts.append(_flight_figures(folder, policies["paper-5v2o"]))
+        parts.append(_training_curve(folder))
+        status.update("one policy with 1 to 200 vehicles")
+        parts.append(_fleets(folder, policies["general"], size.fleet_episodes))
+        status.update("time of training against the number of vehicles")
+        parts.append(_training_time(folder, size.timed_steps))
+    (folder / "results.md").write_text("\n\n".join(parts) + "\n", encoding="utf-8")
+    (folder / "tables.json").write_text(json.dumps(tables, indent=1, default=vars) + "\n", encoding="utf-8")
+    return folder / "results.md"
+
+
+def _head(size: Size) -> str:
+    packages = ", ".join(f"{name} {number}" for name, number in versions().items())
+    return (
+        "# The paper's tables and figures, ours beside theirs\n\n"
+        f"{size.episodes} episodes a row (seed 0), distances in meters, settled values as `docs/choices.md` defines them. "
+        f"Made by `sb3-flock reproduce` with {packages}."
+    )
+
+
+def _fly_all(policy: LoadedPolicy, scenario: Scenario, episodes: int) -> dict[str, dict[str, Metric]]:
+    """The metrics of the policy and of every hand-written controller that is installed."""
+    rows = {"ours": evaluate(policy, scenario, episodes, seed=0)}
+    for name in CONTROLLERS:
+        try:
+            controller = make_controller(name)
+        except SettingsError:  # its library is not installed: the row is left out
+            continue
+        rows[name] = evaluate(controller, scenario, episodes, seed=0)
+    return rows
+
+
+def _tables(tables: dict[str, dict[str, dict[str, Metric]]]) -> str:
+    """Tables I and II with our rows and the peers'."""
+    parts = ["## Tables I and II"]
+    for name, rows in tables.items():
+        n_vehicles, n_obstacles = SETTINGS[name]
+        lines_ = [f"{n_vehicles} vehicles, {n_obstacles} obstacles (`{name}`):\n", *_header()]
+        for table, figures in PAPER[(n_vehicles, n_obstacles)].items():
+            lines_.append(_row(f"paper, {table}", figures))
+        card = read_card(name)
+        trainings = len(card["seeds"])
+        label = f"median of {trainings} trainings" if trainings > 1 else "one training"
+        lines_.append(_row(f"ours, {label}, on record", median_of_seeds(card)))
+        lines_ += _rows(rows)
+        parts.append("\n".join(lines_))
+    return "\n\n".join(parts)
+
+
+def _crossing(rows: dict[str, dict[str, Metric]]) -> str:
+    lines_ = [
+        "## A hard test: obstacles that cross the flock\n",
+        "5 vehicles, 2 obstacles, `--scenario crossing` (`paper-5v2o`, not trained for it):\n",
+    ]
+    return "\n".join([*lines_, *_header(), *_rows(rows)])
+
+
+def _rows(rows: dict[str, dict[str, Metric]]) -> list[str]:
+    shown = {"ours": "ours, the shipped one, flown now"}
+    return [
+        _row(shown.get(name, f"`{name}`"), {metric: values.mean for metric, values in metrics.items()})
+        for name, metrics in rows.items()
+    ]
+
+
+def _header() -> list[str]:
+    return ["| | " + " | ".join(COLUMNS) + " |", "|---" * (len(COLUMNS) + 1) + "|"]
+
+
+def _row(label: str, values: dict[str, Any]) -> str:
+    cells = []
+    for metric in COLUMNS.values():
+        value = values.get(metric)
+        is_rate = metric.endswith("rate") or metric == "connectivity"
+        cells.append("" if value is None else f"{100 * value:.2f} %" if is_rate else f"{value:.3f}")
+    return f"| {label} | " + " | ".join(cells) + " |"
+
+
+def _flight_figures(folder: Path, policy: LoadedPolicy) -> str:
+    save(trajectories(record(PolicyController(policy), policy.scenario, seed=0, episode=1)), folder / "trajectories")
+    save(observation(policy.scenario), folder / "observation")
+    return (
+        "## One flight, and what a vehicle sees\n\n![paths of one episode](trajectories.png)\n\n"
+        "![ten neighbors and the channel that shows them](observation.png)"
+    )
+
+
+def _training_curve(folder: Path) -> str:
+    """The return of the evaluations during the trainings on record, by flock episodes practiced."""
+    series = {}
+    for name, (n_vehicles, n_obstacles) in SETTINGS.items():
+        seeds = read_card(name)["seeds"]
+        steps = load_policy(name).config.flown_scenario()
+        episodes = np.array(seeds[0]["curve"]["timesteps"]) / (steps.n_vehicles * steps.max_cycles)
+        returns = np.array([seed["curve"]["return"] for seed in seeds])
+        series[f"{n_vehicles} vehicles, {n_obstacles} obstacles"] = (episodes, returns)
+    save(lines(series, "episodes of a flock practiced", "return of a vehicle, 100 episodes"), folder / "training")
+    return (
+        "## Training curves\n\n![return against episodes](training.png)\n\nThe line is the median over the trainings, the shade "
+        "all of them. The paper's policy was stable after about 10 000 episodes."
+    )
+
+
+def _fleets(folder: Path, policy: LoadedPolicy, episodes: int) -> str:
+    """One policy flown by ever more vehicles, untrained for most of their numbers."""
+    rows = []
+    for n in FLEETS:
+        arena = max(1.0, (n / _MOST_IN_THE_ARENA) ** 0.5)
+        cycles = round(policy.scenario.max_cycles * arena)
+        scenario = policy.scenario.replace(n_vehicles=n, arena=arena, max_cycles=cycles)
+        rows.append(evaluate(policy, scenario, max(1, episodes // max(1, n // 20)), seed=0))
+    lines_ = [
+        "## One policy, any number of vehicles\n",
+        f"`general`, 2 obstacles; beyond {_MOST_IN_THE_ARENA} vehicles arena and time grow, so that all find a start.\n",
+        *_header(),
+    ]
+    lines_ += [
+        _row(f"{n} vehicle{'s' * (n > 1)}", {name: metric.mean for name, metric in row.items()})
+        for n, row in zip(FLEETS, rows, strict=True)
+    ]
+    series = {
+        "tracking error [m]": (FLEETS, np.array([row["tracking_error"].mean for row in rows])),
+        "least possible tracking error [m]": (FLEETS, np.array([densest_tracking(n) for n in FLEETS])),
+        "vehicle-steps too close to a neighbor": (
+            FLEETS,
+            np.array([row["neighbor_violation_rate"].mean or 0.0 for row in rows]),
+        ),
+        "share not connected": (FLEETS, np.array([1 - (row["connectivity"].mean or 0.0) for row in rows])),
+    }
+    save(lines(series, "vehicles", "meters or share", log_x=True), folder / "fleets")
+    return "\n".join([*lines_, "\n![metrics against vehicles](fleets.png)"])
+
+
+def densest_tracking(n_vehicles: int, separation: float = 0.1) -> float:
+    """About the smallest mean distance to a waypoint of vehicles that keep apart [m]: a triangular lattice's nearest points.
+
+    The lattice is centered on a point, between two or among three, whichever is best; other packings may be a little better.
+    """
+    i, j = (axis.ravel() for axis in np.meshgrid(*2 * [np.arange(-40, 41)]))
+    points = separation * np.stack((i + j / 2, j * np.sqrt(3) / 2), axis=-1)
+    centers = separation * np.array([(0.0, 0.0), (0.5, 0.0), (0.5, np.sqrt(3) / 6)])
+    distances = np.sort(np.linalg.norm(points - centers[:, None], axis=-1), axis=1)
+    return float(distances[:, :n_vehicles].mean(1).min())
+
+
+def _training_time(folder: Path, steps: int) -> str:
+    """Seconds a flock step of training against the number of vehicles, at two rates of updates."""
+    fleets = (1, 3, 5, 8, 12)
+    measured = {
+        "one update a flock step": [_seconds_per_flock_step(n, 1 / n, steps) for n in fleets],
+        "two updates for five transitions (our default)": [_seconds_per_flock_step(n, 0.4, steps) for n in fleets],
+    }
+    series = {label: (fleets, 1000 * np.array(values)) for label, values in measured.items()}
+    save(lines(series, "vehicles", "milliseconds a flock step"), folder / "training_time")
+    cycles = Scenario().max_cycles
+    lines_ = [
+        "## Time of training\n",
+        "| vehicles | " + " | ".join(map(str, fleets)) + " |",
+        "|---" * (len(fleets) + 1) + "|",
+    ]
+    for label, values in measured.items():
+        lines_.append(f"| {label}: ms a flock step | " + " | ".join(f"{1000 * value:.1f}" for value in values) + " |")
+        lines_.append(
+            f"| ms an episode of {cycles} steps | " + " | ".join(f"{1000 * cycles * value:.0f}" for value in values) + " |"
+        )
+    note = (
+        "The paper reports 122, 140 and 147 ms an episode for (3, 1), (5, 1) and (5, 2), and not its episodes' length or its "
+        "rate of updates. The tensor does not grow with the number of vehicles; acting and storing do, and so do the updates "
+        "where they are counted for each transition."
+    )
+    return "\n".join([*lines_, "", "![time against vehicles](training_time.png)", "", note])
+
+
+def _seconds_per_flock_step(n_vehicles: int, update_ratio: float, steps: int) -> float:
+    """Measured over ``steps`` vector steps of the default training, after a warm-up."""
+    config = TrainingConfig()
+    learner = config.learner.replace(update_ratio=update_ratio, learning_starts=config.learner.batch_size)
+    config = config.replace(scenario=Scenario(n_vehicles=n_vehicles, n_obstacles=2), learner=learner, n_flocks=8)
+    env = make_vec_env(config.scenario, config.n_flocks, seed=0)
+    try:
+        model = build_model(config, env)
+        mixing = NeighborInclusiveReward(config.scenario.reward.lambda_)
+        model.learn(10 * env.num_envs + config.learner.batch_size, mixing)
+        start = time.perf_counter()
+        model.learn(steps * env.num_envs, mixing, reset_num_timesteps=False)
+        return (time.perf_counter() - start) / (steps * config.n_flocks)
+    finally:
+        env.close()

@@ -1,0 +1,53 @@
+import json
+
+import numpy as np
+import pytest
+
+from sb3_flock import evaluate, load_policy
+from sb3_flock.evaluation import model_cards
+from sb3_flock.evaluation.model_cards import median_of_seeds, read_card, ship
+from sb3_flock.rl.saving import PolicyError, find_policy, shipped_policies
+from tests.rl.test_training import quiet, tiny, train
+
+SHIPPED = sorted(shipped_policies())
+
+
+def test_the_papers_setups_and_more_are_shipped():
+    assert {"paper-3v1o", "paper-5v1o", "paper-5v2o", "general"} <= set(SHIPPED)
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_a_shipped_policy_flies_as_its_card_says(name):
+    policy, card = load_policy(name), read_card(name)
+    assert policy.path.stat().st_size < 1_000_000
+    check = card["check"]
+    metrics = evaluate(policy, episodes=check["episodes"], seed=check["seed"])
+    assert metrics["tracking_error"].mean == pytest.approx(check["tracking_error"], abs=0.003)
+    assert card["config"] == policy.config.model_dump(mode="json")
+    assert card["versions"] == policy.versions
+    assert card["shipped_seed"] in [seed["seed"] for seed in card["seeds"]]
+
+
+def test_a_card_keeps_every_training_and_the_zip_is_the_best_ones(tmp_path, monkeypatch):
+    runs = [train(tiny(tmp_path, seed=seed, eval_freq=60), quiet()).folder for seed in (0, 1, 2)]
+    path = ship("mine", runs, tmp_path, episodes=3)
+    monkeypatch.setattr(model_cards, "shipped_policies", lambda: {"mine": path})
+    card = read_card("mine")
+    scores = [np.load(run / "evaluations.npz")["score"].min() for run in runs]
+    best = int(np.argmin(scores))
+    assert [seed["seed"] for seed in card["seeds"]] == [0, 1, 2]
+    assert card["shipped_seed"] == best
+    assert path.read_bytes() == (runs[best] / "best_model.zip").read_bytes()
+    errors = [evaluate(load_policy(run), episodes=3, seed=0)["tracking_error"].mean for run in runs]
+    assert median_of_seeds(card)["tracking_error"] == pytest.approx(np.median(errors), abs=1e-4)
+    assert len(card["seeds"][0]["curve"]["timesteps"]) == len(card["seeds"][0]["curve"]["return"]) == 5
+    json.dumps(card, allow_nan=False)
+
+
+def test_a_file_of_the_same_name_wins_over_a_shipped_policy(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert find_policy("paper-5v2o").parent.name == "policies"
+    (tmp_path / "paper-5v2o").write_bytes(b"mine")
+    assert find_policy("paper-5v2o").read_bytes() == b"mine"
+    with pytest.raises(PolicyError, match="nor one of .*paper-5v2o"):
+        find_policy("paper-9v9o")
