@@ -44,12 +44,12 @@ def test_a_single_anchor_by_hand(scenario, place):
 
 def test_bodies_add_up_in_their_own_channel_with_its_own_radius(scenario, place):
     world = place(
-        scenario, [(0.0, 0.0), (0.09, 0.0), (0.09, 0.0)], [0.0] * 3, obstacles=[(0.15, 0.0)], waypoint=(0.16, -0.24)
+        scenario, [(0.0, 0.0), (0.09, 0.0), (0.09, 0.0)], [0.0] * 3, obstacles=[(0.15, 0.0)], waypoint=(0.12, -0.18)
     )
     tensor = observation(world)[0]
     np.testing.assert_allclose(tensor[0, 8, 5], 2.0, rtol=1e-6)  # two neighbors 3 spacings of 0.03 ahead
     np.testing.assert_allclose(tensor[1, 8, 5], 1.0, rtol=1e-6)  # 3 spacings of 0.05 ahead
-    np.testing.assert_allclose(tensor[2, 7, 2], 1.0, rtol=1e-6)  # 2 ahead, 3 to the right, spacing 0.08
+    np.testing.assert_allclose(tensor[2, 7, 2], 1.0, rtol=1e-6)  # 2 ahead, 3 to the right, spacing 0.06
 
 
 def test_the_whole_tensor_against_the_sum_over_bodies(place):

@@ -60,8 +60,8 @@ def test_obstacles_share_the_arena_unless_told_otherwise():
 
 
 def test_channel_radii_default_to_the_sensing_radii():
-    assert Scenario().channel_radii == (0.15, 0.25, 0.4)
-    assert Scenario(neighbor_radius=0.3, obstacle_radius=0.5).channel_radii == (0.3, 0.5, 0.4)
+    assert Scenario().channel_radii == (0.15, 0.25, 0.3)
+    assert Scenario(neighbor_radius=0.3, obstacle_radius=0.5).channel_radii == (0.3, 0.5, 0.3)
 
 
 def test_every_parameter_says_what_it_means():
