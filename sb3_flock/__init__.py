@@ -20,10 +20,11 @@ if TYPE_CHECKING:
     from sb3_flock.rl.config import TrainingConfig
     from sb3_flock.rl.ddpg import FlockDDPG
     from sb3_flock.rl.extractor import FlockCNN
+    from sb3_flock.rl.loading import load_policy
     from sb3_flock.rl.policy import FlockPolicy, FlockSACPolicy
     from sb3_flock.rl.replay import CompactReplayBuffer
-    from sb3_flock.rl.saving import load_policy, save_model
-    from sb3_flock.rl.training import train
+    from sb3_flock.rl.saving import save_model
+    from sb3_flock.rl.training import resume, train
     from sb3_flock.sim import RewardWeights, Scenario, World
 
 __all__ = [
@@ -42,6 +43,7 @@ __all__ = [
     "flocking_v0",
     "load_policy",
     "make_vec_env",
+    "resume",
     "save_model",
     "train",
 ]
@@ -59,9 +61,10 @@ _HOMES = {
     "World": "sim",
     "evaluate": "evaluation",
     "flatten": "envs.vec_env",
-    "load_policy": "rl.saving",
+    "load_policy": "rl.loading",
     "make_vec_env": "envs.vec_env",
     "save_model": "rl.saving",
+    "resume": "rl.training",
     "train": "rl.training",
 }
 

@@ -10,11 +10,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sb3_flock.settings import SettingsError, UserError
+from sb3_flock.settings import RunError, SettingsError, UserError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
+FAILED = 1
 USAGE_ERROR = 2
 INTERRUPTED = 130
 
@@ -42,8 +43,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command.
 
     :param arguments: the words after ``sb3-flock``; the default is the process's own
-    :return: the exit code: 0, 2 after a user's mistake (told in one line on stderr), 130 after Ctrl-C, 1 if nobody reads
-        the output
+    :return: the exit code: 0, 2 after a user's mistake (told in one line on stderr), 1 if the disk, a worker or a training
+        fails or nobody reads the output, 130 after Ctrl-C
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     parser = _parser()
@@ -59,6 +60,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except UserError as error:
         print(f"sb3-flock: {error}", file=sys.stderr)
         return USAGE_ERROR
+    except RunError as error:
+        print(f"sb3-flock: {error}", file=sys.stderr)
+        return FAILED
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -114,6 +118,12 @@ def _add_train(commands: Any) -> None:
         description="Train one shared policy and leave a run folder.",
         epilog="example: sb3-flock train --n-vehicles 5 --n-obstacles 2 --set reward.lambda_=0.5",
     )
+    parser.add_argument(
+        "--resume",
+        metavar="RUN",
+        help="go on with this run folder from its newest whole checkpoint; of the other flags only those that leave alone "
+        "what it learns are accepted, and a larger --total-timesteps",
+    )
     _add_config_flags(parser)
     parser.set_defaults(run=_train)
 
@@ -140,24 +150,40 @@ def _field_help(path: str) -> str:
 
 def _config_of(options: argparse.Namespace) -> Any:
     from sb3_flock.rl.config import TrainingConfig
-    from sb3_flock.rl.config_io import load_config, parse_overrides
+    from sb3_flock.rl.config_io import load_config
+
+    return load_config(TrainingConfig, options.config, _overrides_of(options))
+
+
+def _overrides_of(options: argparse.Namespace) -> dict[str, Any]:
+    from sb3_flock.rl.config_io import parse_overrides
 
     flags = {path: value for path, _ in _TRAIN_FLAGS.values() if (value := getattr(options, path)) is not None}
-    return load_config(TrainingConfig, options.config, {**flags, **parse_overrides(options.set)})
+    return {**flags, **parse_overrides(options.set)}
 
 
 def _train(options: argparse.Namespace, words: Sequence[str]) -> int:
     from rich.console import Console
 
-    config = _config_of(options)
     console = Console(stderr=True)
-    # Imported only now: a mistake in the config is told without waiting for torch.
-    from sb3_flock.rl.saving import load_policy
-    from sb3_flock.rl.training import train
+    # The training is imported after the config is read: a mistake in it is told without waiting for torch.
+    if options.resume is None:
+        config = _config_of(options)
+        from sb3_flock.rl.training import train
 
-    result = train(config, console, command=["sb3-flock", *words])
+        result = train(config, console, command=["sb3-flock", *words])
+    else:
+        if options.config is not None:
+            raise SettingsError("--resume and --config: the run folder has a config of its own")
+        changes = _overrides_of(options)
+        from sb3_flock.rl.training import resume
+
+        result = resume(options.resume, console, changes, command=["sb3-flock", *words])
+    from sb3_flock.rl.loading import load_policy
+
     policy = load_policy(result.best_model)
-    _evaluate_and_print(policy, str(policy.path), config.scenario, config.test_episodes, seed=0, console=console)
+    episodes = result.config.test_episodes
+    _evaluate_and_print(policy, str(policy.path), result.config.scenario, episodes, seed=0, console=console)
     print(result.folder)
     return 0
 
@@ -181,6 +207,7 @@ def _add_evaluate(commands: Any) -> None:
     parser.add_argument("--seed", type=_count(0), default=0, metavar="N", help="seed of the episodes [0]")
     parser.add_argument("--device", default="cpu", metavar="NAME", help="torch device [cpu]")
     parser.add_argument("--json", metavar="FILE", help="write the metrics to this file, too")
+    parser.add_argument("--trust", action="store_true", help="let SB3 load the policy, which runs any code in the file")
     _add_set(parser, "obstacle_arena=0.5")
     parser.set_defaults(run=_evaluate)
 
@@ -214,9 +241,11 @@ def _evaluate(options: argparse.Namespace, words: Sequence[str]) -> int:
 
         flyer, name, trained_for = make_controller(options.controller), options.controller, Scenario()
     else:
-        from sb3_flock.rl.saving import load_policy
+        from sb3_flock.rl.loading import load_policy
 
-        flyer = load_policy(options.policy, options.device)
+        if options.trust:
+            print("sb3-flock: warning: --trust runs any code that is in the policy file", file=sys.stderr)
+        flyer = load_policy(options.policy, options.device, options.trust)
         name, trained_for = str(flyer.path), flyer.scenario
     overrides = parse_overrides(options.set)
     flags = ("n_vehicles", "n_obstacles", "obstacle_motion")

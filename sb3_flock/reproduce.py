@@ -21,7 +21,8 @@ from sb3_flock.evaluation.report import PAPER
 from sb3_flock.rl.algorithms import build_model
 from sb3_flock.rl.callbacks import NeighborInclusiveReward
 from sb3_flock.rl.config import TrainingConfig
-from sb3_flock.rl.saving import LoadedPolicy, load_policy, shipped_policies, versions
+from sb3_flock.rl.loading import LoadedPolicy, load_policy, shipped_policies
+from sb3_flock.rl.saving import versions
 from sb3_flock.settings import SettingsError
 from sb3_flock.sim import Scenario
 

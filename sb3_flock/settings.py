@@ -20,6 +20,10 @@ class UserError(ValueError):
     """Something that the user can mend; the message is one line that says what."""
 
 
+class RunError(RuntimeError):
+    """Something outside of the parameters went wrong in a run: a full disk, a dead worker, a diverged training."""
+
+
 class SettingsError(UserError):
     """A parameter has a value that is not accepted."""
 

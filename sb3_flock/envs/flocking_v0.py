@@ -33,6 +33,7 @@ ready ``scenario``, and ``render_mode``.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -161,6 +162,21 @@ class parallel_env(ParallelEnv[str, Observation, Action]):  # noqa: N801 - Petti
     def state(self) -> NDArray[np.float32]:
         """All vehicles' observations stacked, ``(vehicles, 3, l, l)``."""
         return observe(sense(self.world), self.scenario)[0]
+
+    def state_dict(self) -> dict[str, Any]:
+        """The episode under way and the random stream: plain values and arrays."""
+        rng = None if self._rng is None else self._rng.bit_generator.state
+        return {"world": self.world.state_dict() if self.agents else None, "rng": rng}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on with the episode of :meth:`state_dict`; what follows is the same to the last bit."""
+        if state["rng"] is not None:
+            self._rng = np.random.default_rng()
+            self._rng.bit_generator.state = state["rng"]
+        self.agents = []
+        if state["world"] is not None:
+            self.world.load_state_dict(state["world"])
+            self.agents = list(self.possible_agents)
 
     def close(self) -> None:
         """Close the window, if there is one."""

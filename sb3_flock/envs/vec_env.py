@@ -7,7 +7,7 @@ Every agent of every copy becomes one slot of the vector env, copy by copy: slot
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -21,7 +21,7 @@ from supersuit.vector.multiproc_vec import ProcConcatVec, numpy_deepcopy
 from supersuit.vector.sb3_vector_wrapper import SB3VecEnvWrapper
 
 from sb3_flock.envs import flocking_v0
-from sb3_flock.settings import check_integer
+from sb3_flock.settings import RunError, check_integer
 from sb3_flock.sim import Scenario
 
 
@@ -155,7 +155,7 @@ class ParameterSharingVecEnv(SB3VecEnvWrapper):
             dead = [f"{proc.pid} (exit code {proc.exitcode})" for proc in self.venv.procs if not proc.is_alive()]
             self.close()
             who = ", ".join(dead) or "unknown"
-            raise RuntimeError(f"an environment worker died: process {who}; the rest was closed") from error
+            raise RunError(f"an environment worker died: process {who}; the rest was closed") from error
 
     def close(self) -> None:
         """Close every copy, in the workers too, and end the workers."""
@@ -174,6 +174,20 @@ class ParameterSharingVecEnv(SB3VecEnvWrapper):
                 proc.kill()  # it is dead, or not listening
             proc.join(self.venv.graceful_shutdown_timeout)
         self.venv.close()
+
+    # -- going on elsewhere ------------------------------------------------------------------------------------------
+
+    def state_dict(self) -> list[dict[str, Any]] | None:
+        """The episodes under way and the random streams of every copy, or ``None`` where workers keep them."""
+        if self._has_workers:
+            return None
+        return [env.unwrapped.state_dict() for env in self._copies(range(0, self.num_envs, self.n_agents))]
+
+    def load_state_dict(self, state: Sequence[Mapping[str, Any]]) -> None:
+        """Go on with the episodes of :meth:`state_dict`; the next reset starts no stream anew."""
+        for env, saved in zip(self._copies(range(0, self.num_envs, self.n_agents)), state, strict=True):
+            env.unwrapped.load_state_dict(saved)
+        self._seed, self._unseeded = None, False
 
     # -- SB3's access to the copies ----------------------------------------------------------------------------------
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from sb3_flock.evaluation.episodes import evaluate
-from sb3_flock.rl.saving import load_policy, shipped_policies
+from sb3_flock.rl.loading import load_policy, shipped_policies
 
 CHECK_EPISODES, CHECK_SEED = 50, 7
 """The short flight whose tracking error a card keeps, to tell whether the policy still flies as it did."""

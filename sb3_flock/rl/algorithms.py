@@ -53,6 +53,7 @@ def build_model(config: TrainingConfig, env: VecEnv) -> OffPolicyAlgorithm:
     learner = config.learner
     gradient_steps = max(1, round(learner.update_ratio * learner.train_freq * env.num_envs))
     algorithm, policy = ALGORITHMS[config.algo]
+    buffer = _replay_buffer_class(config)
     return algorithm(
         policy,
         env,
@@ -65,7 +66,8 @@ def build_model(config: TrainingConfig, env: VecEnv) -> OffPolicyAlgorithm:
         train_freq=learner.train_freq,
         gradient_steps=gradient_steps,
         n_steps=learner.n_steps,
-        replay_buffer_class=_replay_buffer_class(config),
+        replay_buffer_class=buffer,
+        replay_buffer_kwargs={"mirror": learner.mirror} if buffer else None,
         action_noise=_noise(config),
         policy_kwargs=policy_kwargs(config),
         seed=config.seed,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict, deque
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -71,6 +72,15 @@ class NeighborInclusiveReward(BaseCallback):
             self.logger.record("rollout/ep_mixed_rew_mean", float(np.mean(self._finished)))
         return True
 
+    def state_dict(self) -> dict[str, Any]:
+        """The returns of the episodes under way and of the last ones."""
+        return {"returns": self._returns, "finished": list(self._finished)}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from :meth:`state_dict`."""
+        self._returns[:] = state["returns"]
+        self._finished.extend(state["finished"])
+
     def mix(self, rewards: np.ndarray, infos: list[dict[str, Any]]) -> np.ndarray:
         """The mixed reward of every slot of the vector env, ``(slots,)``."""
         neighbors = [np.asarray(info.get("neighbors", ()), dtype=np.int64) for info in infos]
@@ -99,6 +109,15 @@ class FlockMetrics(BaseCallback):
             self._sums.clear()
             self._count = 0
         return True
+
+    def state_dict(self) -> dict[str, Any]:
+        """The sums so far."""
+        return {"sums": dict(self._sums), "count": self._count}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from :meth:`state_dict`."""
+        self._sums.update(state["sums"])
+        self._count = state["count"]
 
 
 class FadingNoise(BaseCallback):

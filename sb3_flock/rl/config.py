@@ -9,18 +9,20 @@ from pydantic import Field
 from sb3_flock.settings import Settings
 from sb3_flock.sim import Scenario
 
-Width = Annotated[int, Field(ge=1)]
+Width = Annotated[int, Field(ge=1, le=65_536)]
 
 
 class NetworkConfig(Settings):
     """The networks' shapes (paper, IV-C)."""
 
     channels: tuple[Width, Width] = Field((16, 32), description="output channels of the two convolutions (open)")
-    kernel_size: int = Field(3, ge=1, description="side of the convolutions' kernels [anchors] (open)")
+    kernel_size: int = Field(3, ge=1, le=15, description="side of the convolutions' kernels [anchors] (open)")
     stride: int = Field(2, ge=1, description="stride of the convolutions [anchors] (open)")
-    features_dim: int = Field(128, ge=1, description="width of the dense layer behind the convolutions (open)")
-    net_arch: tuple[Width, ...] = Field((64,), description="widths of the hidden layers behind the features (open)")
-    action_layer: int = Field(32, ge=1, description="width of the critic's hidden layer for the action (open)")
+    features_dim: Width = Field(128, description="width of the dense layer behind the convolutions (open)")
+    net_arch: tuple[Width, ...] = Field(
+        (64,), max_length=16, description="widths of the hidden layers behind the features (open)"
+    )
+    action_layer: Width = Field(32, description="width of the critic's hidden layer for the action (open)")
     layer_norm: bool = Field(True, description="normalize the dense layer's output (ours; paper: no)")
     final_init: float | None = Field(
         3e-3, gt=0, description="bound of the output layers' uniform start; null: torch's own (open)"
@@ -29,7 +31,7 @@ class NetworkConfig(Settings):
         "inverting",
         description="how the actor's output is bounded, but for sac: a clamp with inverting gradients or tanh (open)",
     )
-    n_critics: int = Field(2, ge=1, description="critic networks, the smallest value counts (ours; paper: 1)")
+    n_critics: int = Field(2, ge=1, le=32, description="critic networks, the smallest value counts (ours; paper: 1)")
 
 
 class LearnerConfig(Settings):
@@ -42,6 +44,10 @@ class LearnerConfig(Settings):
     learning_starts: int = Field(4_000, ge=0, description="transitions flown with random actions before learning (open)")
     gamma: float = Field(0.96, ge=0, lt=1, description="discount factor (open)")
     tau: float = Field(0.005, gt=0, le=1, description="update rate of the target networks (open)")
+    mirror: bool = Field(
+        True,
+        description="mirror half of every minibatch, left for right; not with ddpg-stock or n_steps > 1 (ours; paper: no)",
+    )
     n_steps: int = Field(1, ge=1, description="steps of the return in the critic's target (paper: 1)")
     train_freq: int = Field(1, ge=1, description="vector steps (one transition a vehicle) between rounds of updates")
     update_ratio: float = Field(0.4, gt=0, description="updates for each transition flown (paper, Algorithm 1: 1)")
@@ -90,7 +96,7 @@ class TrainingConfig(Settings):
     learner: LearnerConfig = Field(default_factory=LearnerConfig, description="the learner")
     network: NetworkConfig = Field(default_factory=NetworkConfig, description="the networks")
 
-    total_timesteps: int = Field(250_000, ge=1, description="transitions to train for")
+    total_timesteps: int = Field(300_000, ge=1, description="transitions to train for")
     n_flocks: int = Field(32, ge=1, description="flocks flown side by side")
     num_cpus: int = Field(0, ge=0, description="SuperSuit worker processes; 0: fly in the training process (faster)")
     seed: int = Field(0, ge=0, le=2**32 - 1, description="seed of the networks, the noise and the flocks")
@@ -102,7 +108,8 @@ class TrainingConfig(Settings):
     eval_freq: int = Field(10_000, ge=0, description="transitions between evaluations; 0: none")
     eval_episodes: int = Field(100, ge=1, description="episodes of an evaluation, the same ones every time")
     test_episodes: int = Field(1000, ge=1, description="episodes of the table that `sb3-flock train` prints at the end")
-    save_freq: int = Field(100_000, ge=0, description="transitions between checkpoints; 0: none")
+    save_freq: int = Field(25_000, ge=0, description="transitions between checkpoints; 0: none")
+    keep_checkpoints: int = Field(2, ge=1, description="newest checkpoints that are kept; `train --resume` goes on from one")
     init_from: str | None = Field(None, description="policy (zip or run folder) whose weights to start from")
     output_dir: str = Field("runs", description="folder of the run folders")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ class CompactReplayBuffer(ReplayBuffer):
 
     :param buffer_size: transitions at most
     :param observation_space: a ``Box`` of floats
+    :param mirror: return half of every sample as in a mirror, left for right: as true to the task as the transition flown
 
     The other parameters are those of SB3's ``ReplayBuffer``.
     """
@@ -34,6 +36,7 @@ class CompactReplayBuffer(ReplayBuffer):
         n_envs: int = 1,
         optimize_memory_usage: bool = False,
         handle_timeout_termination: bool = True,
+        mirror: bool = False,
     ) -> None:
         half = spaces.Box(-1.0, 1.0, observation_space.shape, np.float16)  # only its shape and type count
         # One row more than asked for: the row after the newest holds its next observation, and is not sampled.
@@ -48,6 +51,7 @@ class CompactReplayBuffer(ReplayBuffer):
         )
         self.observation_space = observation_space
         self.handle_timeout_termination = handle_timeout_termination
+        self.mirror = mirror
         self._last_observations: dict[int, dict[int, NDArray[np.float16]]] = {}
 
     def add(
@@ -71,12 +75,17 @@ class CompactReplayBuffer(ReplayBuffer):
         env_indices = np.random.randint(0, high=self.n_envs, size=(len(batch_inds),))  # noqa: NPY002 - as SB3 draws them
         at = (batch_inds, env_indices)
         next_observations = self.observations[(batch_inds + 1) % self.buffer_size, env_indices]
-        dones = self.dones[at]
+        observations, actions, dones = self.observations[at], self.actions[at], self.dones[at]
         for row in np.flatnonzero(dones):
             next_observations[row] = self._last_observations[batch_inds[row]][env_indices[row]]
+        if self.mirror:
+            half = len(batch_inds) // 2
+            for tensors in (observations, next_observations):
+                tensors[:half] = tensors[:half, ..., ::-1].copy()
+            actions[:half, 1] *= -1
         return ReplayBufferSamples(
-            self._to_float(self.observations[at]),
-            self.to_torch(self.actions[at], copy=False),
+            self._to_float(observations),
+            self.to_torch(actions, copy=False),
             self._to_float(next_observations),
             self.to_torch((dones * (1 - self.timeouts[at]))[:, None], copy=False),
             self.to_torch(self.rewards[at][:, None], copy=False),
@@ -84,3 +93,43 @@ class CompactReplayBuffer(ReplayBuffer):
 
     def _to_float(self, observations: NDArray[np.float16]) -> th.Tensor:
         return self.to_torch(observations, copy=False).float()
+
+
+def replay_state(buffer: ReplayBuffer) -> dict[str, Any]:
+    """What a replay buffer holds, its used rows alone; of ours or of SB3's."""
+    used = min(buffer.pos + 1, buffer.buffer_size) if not buffer.full else buffer.buffer_size  # + 1: the next observation
+    state = {"pos": buffer.pos, "full": buffer.full, "arrays": {name: rows[:used] for name, rows in _rows(buffer).items()}}
+    if isinstance(buffer, CompactReplayBuffer):
+        last = [(row, env, tensor) for row, envs in buffer._last_observations.items() for env, tensor in envs.items()]
+        shape = buffer.observations.shape[2:]
+        state["last_places"] = np.array([(row, env) for row, env, _ in last], dtype=np.int64).reshape(-1, 2)
+        state["last_observations"] = np.array([tensor for *_, tensor in last], dtype=np.float16).reshape(-1, *shape)
+    return state
+
+
+def load_replay_state(buffer: ReplayBuffer, state: Mapping[str, Any]) -> None:
+    """Fill a buffer of the same kind and size.
+
+    :raises ValueError: if the rows do not fit
+    """
+    for name, rows in _rows(buffer).items():
+        saved = state["arrays"][name]
+        if saved.dtype != rows.dtype or saved.shape[1:] != rows.shape[1:]:
+            raise ValueError(
+                f"replay buffer's {name}: {saved.dtype} {saved.shape} where {rows.dtype} {rows.shape} is needed"
+            )
+        rows[: len(saved)] = saved
+    buffer.pos, buffer.full = state["pos"], state["full"]
+    if isinstance(buffer, CompactReplayBuffer):
+        buffer._last_observations = {}
+        for (row, env), tensor in zip(state["last_places"].tolist(), state["last_observations"], strict=True):
+            buffer._last_observations.setdefault(row, {})[env] = tensor
+
+
+def _rows(buffer: ReplayBuffer) -> dict[str, NDArray[Any]]:
+    """The arrays with a row a vector step."""
+    return {
+        name: value
+        for name, value in vars(buffer).items()
+        if isinstance(value, np.ndarray) and value.shape[:2] == (buffer.buffer_size, buffer.n_envs)
+    }

@@ -2,38 +2,34 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
-import shlex
-import sys
-import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch as th
 from rich.console import Console
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
-from stable_baselines3.common.logger import configure
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
 from sb3_flock.envs.vec_env import make_vec_env
-from sb3_flock.evaluation.episodes import PolicyController, fly
-from sb3_flock.evaluation.metrics import score
 from sb3_flock.rl.algorithms import build_model
 from sb3_flock.rl.callbacks import FadingNoise, FlockMetrics, NeighborInclusiveReward
+from sb3_flock.rl.checkpoints import LoadedCheckpoint, Stateful, inexactness, newest_checkpoint
 from sb3_flock.rl.config import TrainingConfig
-from sb3_flock.rl.config_io import to_yaml
+from sb3_flock.rl.config_io import load_config
+from sb3_flock.rl.loading import PolicyError, check_device, checkpoint_paths, load_policy
+from sb3_flock.rl.logs import make_logger, told_once
 from sb3_flock.rl.progress import FlockProgress
-from sb3_flock.rl.saving import PolicyError, check_device, load_policy, save_model, versions
-from sb3_flock.settings import SettingsError
+from sb3_flock.rl.run_folder import describe_run, locked, new_run_folder
+from sb3_flock.rl.safety import Checkpoints, FiniteLosses, Signals
+from sb3_flock.rl.saving import save_model
+from sb3_flock.rl.selection import Evaluation
+from sb3_flock.settings import RunError, SettingsError
 from sb3_flock.sim import Scenario, World, episode_rng
-
-SELECTION_SEED = 1_000_000
-"""Seed of the episodes on which the best model is chosen; no result is reported on them."""
-
 
 _WIDE_BATCH = 1024
 """Batch from which a second torch thread saves a fifth of an update's time or more; at 128 it saves nothing."""
@@ -44,6 +40,7 @@ class TrainingResult:
     """What a training leaves."""
 
     folder: Path
+    config: TrainingConfig
     model: OffPolicyAlgorithm
     best_model: Path
     """The zip that scored best, or the final one if there was no evaluation."""
@@ -58,9 +55,9 @@ def train(
     """Train one policy and leave a run folder ``<output_dir>/<algo>_<n>v<m>o_<k>``.
 
     The folder holds ``config.yaml`` (fully resolved), ``command.txt``, ``versions.txt``, TensorBoard's events and
-    ``progress.csv``, ``evaluations.npz``, ``rl_model_<steps>_steps.zip`` every ``save_freq`` transitions,
-    ``best_model.zip`` (lowest :func:`~sb3_flock.evaluation.metrics.score` at an evaluation) and ``final_model.zip``. An
-    interrupted training leaves its ``final_model.zip`` too.
+    ``progress.csv``, ``evaluations.npz``, the newest checkpoints ``rl_model_<steps>_steps.zip``, ``best_model.zip`` (lowest
+    :func:`~sb3_flock.evaluation.metrics.score` at an evaluation) and, once it is complete, ``final_model.zip``. SIGINT and
+    SIGTERM wait for a checkpoint; :func:`resume` goes on from one.
 
     :param config: everything that decides the run
     :param console: where progress goes; the default prints to stderr
@@ -69,8 +66,85 @@ def train(
     :raises SettingsError: for a device or a folder that cannot be used
     :raises PolicyError: for a policy to start from that cannot be used
     :raises WorldError: if the arena is too crowded to start
+    :raises RunError: if the disk is full, a worker dies or a loss is not finite; what was saved stays
     """
     console = console or Console(stderr=True)
+    with Signals().waiting() as signals:
+        model, env = _prepare(config)
+        try:
+            folder = new_run_folder(config, command)
+            with locked(folder):
+                return _run(config, folder, model, None, console, callbacks, signals)
+        finally:
+            env.close()
+
+
+def resume(
+    folder: str | Path,
+    console: Console | None = None,
+    changes: Mapping[str, Any] | None = None,
+    command: Sequence[str] | None = None,
+    callbacks: Iterable[BaseCallback] = (),
+) -> TrainingResult:
+    """Go on with a run from its newest whole checkpoint, or from its start if there is none.
+
+    On the CPU, with one thread, in one process and with the same versions the result is the same to the last bit as that of a
+    run never interrupted; otherwise a line says why it is not.
+
+    :param folder: the run folder
+    :param console: as in :func:`train`
+    :param changes: fields of the config to change: those in :data:`RESUMABLE`
+    :param command: the words of the command line, added to ``command.txt``
+    :param callbacks: as in :func:`train`; what they hold is not in the checkpoint
+    :raises SettingsError: for a folder that is not a run's or is in use, a field that cannot change, a run that is complete
+    :raises RunError: as in :func:`train`
+    """
+    folder, console = Path(folder), console or Console(stderr=True)
+    if not (folder / "config.yaml").is_file():
+        raise SettingsError(f"resume {folder}: not a run folder (there is no config.yaml)")
+    config = load_config(TrainingConfig, folder / "config.yaml")
+    fixed = [name for name in changes or {} if name not in RESUMABLE]
+    if fixed:
+        raise SettingsError(f"{fixed[0]} cannot change in a resumed run, only {', '.join(RESUMABLE)}")
+    config = load_config(TrainingConfig, overrides=changes, base=config)
+
+    def tell(line: str) -> None:
+        console.print(line, soft_wrap=True, highlight=False)
+
+    with Signals().waiting() as signals, locked(folder):
+        checkpoint = newest_checkpoint(folder, config, tell)
+        done = checkpoint.num_timesteps if checkpoint else 0
+        if done >= config.total_timesteps and (folder / "final_model.zip").exists():
+            raise SettingsError(
+                f"resume {folder}: the run is complete with {done} transitions; a larger total_timesteps is needed to go on"
+            )
+        model, env = _prepare(config)
+        try:
+            tell(f"resumes {folder} after {done} of {config.total_timesteps} transitions{inexactness(checkpoint, config)}")
+            if checkpoint:
+                checkpoint.restore_model(model)
+            describe_run(folder, config, command)
+            return _run(config, folder, model, checkpoint, console, callbacks, signals)
+        finally:
+            env.close()
+
+
+RESUMABLE = (
+    "total_timesteps",
+    "device",
+    "torch_threads",
+    "num_cpus",
+    "eval_freq",
+    "eval_episodes",
+    "test_episodes",
+    "save_freq",
+    "keep_checkpoints",
+)
+"""Fields that a resumed run may change: all but the first leave what is learned as it is, or nearly."""
+
+
+def _prepare(config: TrainingConfig) -> tuple[OffPolicyAlgorithm, VecEnv]:
+    """The model, untrained, and its flocks; whatever can be wrong with a config comes out here."""
     th.set_num_threads(config.torch_threads or (1 if config.learner.batch_size < _WIDE_BATCH else _cores()))
     check_device(config.device)
     flown = config.flown_scenario()
@@ -78,114 +152,69 @@ def train(
         World(scenario).reset([episode_rng(config.seed, 0)])
     env = VecMonitor(make_vec_env(flown, config.n_flocks, config.num_cpus, seed=config.seed))
     try:
-        model = _build(config, env)
-        folder = _new_run_folder(config)
-        model.set_logger(configure(str(folder), ["tensorboard", "csv"]))
-        _describe_run(folder, config, command)
-        console.print(_summary(config, flown, model, folder), soft_wrap=True, highlight=False)
-        progress = FlockProgress(console, config.total_timesteps)
-        parts: list[BaseCallback] = [
-            NeighborInclusiveReward(flown.reward.lambda_),
-            FlockMetrics(),
-            Evaluation(config, folder, progress),
-            Checkpoints(config, folder),
-            progress,
-            *callbacks,
-        ]
-        if model.action_noise is not None:
-            parts.append(FadingNoise(config.learner.noise, config.learner.final_noise))
-        try:
-            model.learn(config.total_timesteps, CallbackList(parts), log_interval=config.n_flocks * flown.n_vehicles)
-        finally:
-            progress.stop()
-            model.logger.close()
-            save_model(model, folder / "final_model.zip", config)
-    finally:
+        return _build(config, env), env
+    except BaseException:
         env.close()
+        raise
+
+
+def _run(
+    config: TrainingConfig,
+    folder: Path,
+    model: OffPolicyAlgorithm,
+    checkpoint: LoadedCheckpoint | None,
+    console: Console,
+    callbacks: Iterable[BaseCallback],
+    signals: Signals,
+) -> TrainingResult:
+    """Learn until the end or a signal."""
+    flown = config.flown_scenario()
+    console.print(_summary(config, flown, model, folder), soft_wrap=True, highlight=False)
+    progress = FlockProgress(console, config.total_timesteps)
+    rewards, metrics = NeighborInclusiveReward(flown.reward.lambda_), FlockMetrics()
+    evaluation = Evaluation(config, folder, progress)
+    stateful: dict[str, Stateful] = {"rewards": rewards, "metrics": metrics, "evaluation": evaluation}
+    parts: list[BaseCallback] = [
+        rewards,
+        metrics,
+        evaluation,
+        FiniteLosses(),
+        progress,
+        *callbacks,
+        Checkpoints(config, folder, stateful, checkpoint, signals),
+    ]
+    if model.action_noise is not None:
+        parts.append(FadingNoise(config.learner.noise, config.learner.final_noise))
+    try:
+        model.set_logger(make_logger(folder, model.num_timesteps))
+        with told_once():
+            model.learn(
+                config.total_timesteps - model.num_timesteps,
+                CallbackList(parts),
+                log_interval=config.n_flocks * flown.n_vehicles,
+                reset_num_timesteps=checkpoint is None,
+            )
+        save_model(model, folder / "final_model.zip", config)
+    except (KeyboardInterrupt, SystemExit):
+        progress.stop()
+        console.print(_go_on(folder), soft_wrap=True, highlight=False)
+        raise
+    except OSError as error:
+        where = folder if error.filename is None else os.fsdecode(error.filename)
+        raise RunError(f"{where}: {error.strerror or error}; {_go_on(folder)}") from error
+    except RunError as error:
+        raise RunError(f"{error}; {_go_on(folder)}") from error
+    finally:
+        progress.stop()
+        with contextlib.suppress(OSError):
+            model.logger.close()
     best = folder / "best_model.zip"
-    return TrainingResult(folder, model, best if best.exists() else folder / "final_model.zip")
+    return TrainingResult(folder, config, model, best if best.exists() else folder / "final_model.zip")
 
 
-class Evaluation(BaseCallback):
-    """Flies the same episodes every ``eval_freq`` transitions, logs ``eval/``, keeps the best model by its score."""
-
-    def __init__(self, config: TrainingConfig, folder: Path, progress: FlockProgress) -> None:
-        super().__init__()
-        self.config, self.folder, self.progress = config, folder, progress
-        self.best_score = np.inf
-        self._due = _Due(config.eval_freq)
-        self._history: dict[str, list[Any]] = {"timesteps": [], "seconds": [], "results": [], "ep_lengths": []}
-        self._started = 0.0
-
-    def _on_step(self) -> bool:
-        return True
-
-    def _on_training_start(self) -> None:
-        self._started = time.monotonic()
-
-    def _on_rollout_end(self) -> None:
-        if self._due(self.num_timesteps):
-            self._evaluate()
-
-    def _on_training_end(self) -> None:
-        if self.config.eval_freq and (self._history["timesteps"] or [0])[-1] < self.num_timesteps:
-            self._evaluate()
-
-    def _evaluate(self) -> None:
-        config = self.config
-        values = fly(PolicyController(self.model), config.scenario, config.eval_episodes, SELECTION_SEED)
-        means = {name: float(np.nanmean(value)) if not np.isnan(value).all() else np.nan for name, value in values.items()}
-        current = score(means)
-        for name, mean in {**means, "score": current}.items():
-            self.logger.record(f"eval/{name}", mean)
-            self._history.setdefault(name, []).append(mean)
-        self._history["timesteps"].append(self.num_timesteps)
-        self._history["seconds"].append(time.monotonic() - self._started)
-        self._history["results"].append(values["return"])
-        self._history["ep_lengths"].append([config.scenario.max_cycles] * config.eval_episodes)
-        history: dict[str, Any] = {name: np.asarray(rows) for name, rows in self._history.items()}
-        np.savez(self.folder / "evaluations.npz", **history)
-        is_best = current < self.best_score
-        if is_best:
-            self.best_score = current
-            save_model(self.model, self.folder / "best_model.zip", config, optimizers=False)
-        self.logger.dump(self.num_timesteps)
-        self.progress.report_evaluation(
-            f"evaluation at {self.num_timesteps}: tracking {means['tracking_error']:.3f} m, "
-            f"too close {100 * means['neighbor_violation_rate']:.2f} %, "
-            f"obstacle {100 * means['obstacle_violation_rate']:.2f} %, connected {100 * means['connectivity']:.1f} %, "
-            f"score {current:.3f}{' (best)' if is_best else ''}"
-        )
-
-
-class Checkpoints(BaseCallback):
-    """Saves ``rl_model_<steps>_steps.zip`` every ``save_freq`` transitions."""
-
-    def __init__(self, config: TrainingConfig, folder: Path) -> None:
-        super().__init__()
-        self.config, self.folder = config, folder
-        self._due = _Due(config.save_freq)
-
-    def _on_step(self) -> bool:
-        return True
-
-    def _on_rollout_end(self) -> None:
-        if self._due(self.num_timesteps):
-            save_model(self.model, self.folder / f"rl_model_{self.num_timesteps}_steps.zip", self.config)
-
-
-class _Due:
-    """Tells when another ``freq`` transitions have been flown; never if ``freq`` is 0."""
-
-    def __init__(self, freq: int) -> None:
-        self.freq = freq
-        self._next = freq
-
-    def __call__(self, num_timesteps: int) -> bool:
-        if not self.freq or num_timesteps < self._next:
-            return False
-        self._next = num_timesteps - num_timesteps % self.freq + self.freq
-        return True
+def _go_on(folder: Path) -> str:
+    saved = checkpoint_paths(folder)
+    return f"{saved[-1].name if saved else 'nothing'} is saved; to go on: sb3-flock train --resume {folder}"
 
 
 def _build(config: TrainingConfig, env: VecEnv) -> OffPolicyAlgorithm:
@@ -215,29 +244,3 @@ def _summary(config: TrainingConfig, flown: Scenario, model: OffPolicyAlgorithm,
 def _cores() -> int:
     """Cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _new_run_folder(config: TrainingConfig) -> Path:
-    """Make the next free ``<algo>_<n>v<m>o_<k>``; two trainings at once never share one."""
-    root = Path(config.output_dir)
-    stem = f"{config.algo}_{config.scenario.n_vehicles}v{config.scenario.n_obstacles}o"
-    try:
-        root.mkdir(parents=True, exist_ok=True)
-        taken = [int(path.name[len(stem) + 1 :]) for path in root.glob(f"{stem}_*") if path.name[len(stem) + 1 :].isdigit()]
-        number = max(taken, default=0) + 1
-        while True:
-            folder = root / f"{stem}_{number}"
-            try:
-                folder.mkdir()
-            except FileExistsError:
-                number += 1
-            else:
-                return folder
-    except OSError as error:
-        raise SettingsError(f"output_dir = {config.output_dir}: {error.strerror or error}") from None
-
-
-def _describe_run(folder: Path, config: TrainingConfig, command: Sequence[str] | None) -> None:
-    (folder / "config.yaml").write_text(to_yaml(config), encoding="utf-8")
-    (folder / "command.txt").write_text(shlex.join(command or sys.argv) + "\n", encoding="utf-8")
-    (folder / "versions.txt").write_text("".join(f"{name}=={number}\n" for name, number in versions().items()))

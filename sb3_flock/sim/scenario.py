@@ -50,7 +50,7 @@ class Scenario(Settings):
     detection_range: float = Field(0.25, gt=0, description="obstacle detection range r_o [m] (paper, V)")
     obstacle_separation: float = Field(0.15, ge=0, description="minimum separation to obstacles r_o' [m] (paper, V)")
 
-    n_anchors: int = Field(11, ge=2, description="anchors per side l of each tensor channel (paper, IV-A: 11)")
+    n_anchors: int = Field(11, ge=2, le=101, description="anchors per side l of each tensor channel (paper, IV-A: 11)")
     neighbor_radius: float | None = Field(
         None, gt=0, description="half width of the neighbor channel [m]; null: link_range (paper, IV-A: r_c)"
     )

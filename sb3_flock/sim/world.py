@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,6 +23,18 @@ _MAX_REDRAWS = 1000
 
 _SLOWEST_CROSSING = 0.6
 """Slowest crossing obstacle [top speeds]: from the arena's edge to the origin in 100 to 167 steps, when the flock is there."""
+
+
+_EPISODE = (
+    "positions",
+    "headings",
+    "obstacle_positions",
+    "obstacle_headings",
+    "waypoints",
+    "_obstacle_speeds",
+    "_obstacle_turns",
+)
+"""The arrays of an episode under way."""
 
 
 class WorldError(UserError):
@@ -125,6 +137,32 @@ class World:
         self.waypoints = self.waypoints * (1.0 - np.minimum(stride / np.maximum(distance, stride or 1.0), 1.0))
         self.steps += 1
         return sense(self), clipped
+
+    def state_dict(self) -> dict[str, Any]:
+        """The episode under way: all that its next steps depend on besides the actions."""
+        return {**{name: getattr(self, name) for name in _EPISODE}, "steps": self.steps}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on with the episode of :meth:`state_dict`.
+
+        :raises ValueError: if it is one of other numbers of bodies or steps
+        """
+        flocks, vehicles, obstacles = self.n_flocks, self.scenario.n_vehicles, self.scenario.n_obstacles
+        walk = (self.scenario.max_cycles, flocks, obstacles)
+        shapes = (
+            (flocks, vehicles, 2),
+            (flocks, vehicles),
+            (flocks, obstacles, 2),
+            (flocks, obstacles),
+            (flocks, 2),
+            walk,
+            walk,
+        )
+        for name, shape in zip(_EPISODE, shapes, strict=True):
+            if state[name].shape != shape:
+                raise ValueError(f"{name} has the shape {state[name].shape}: {shape} is needed")
+            setattr(self, name, np.array(state[name], dtype=np.float64))
+        self.steps = int(state["steps"])
 
     def _move_obstacles(self, dt: float) -> None:
         """Unicycles with drawn speeds and turn rates, turned back at the edge of their square."""

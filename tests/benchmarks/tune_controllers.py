@@ -18,7 +18,7 @@ from sb3_flock.evaluation.controllers.olfati_saber import OlfatiGains, OlfatiSab
 from sb3_flock.evaluation.controllers.orca import Orca, OrcaGains
 from sb3_flock.evaluation.episodes import fly
 from sb3_flock.evaluation.metrics import score
-from sb3_flock.rl.training import SELECTION_SEED
+from sb3_flock.rl.selection import SELECTION_SEED
 
 RANGES: dict[str, tuple[Any, Any, dict[str, tuple[float, float]]]] = {
     "orca": (

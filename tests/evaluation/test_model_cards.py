@@ -6,7 +6,7 @@ import pytest
 from sb3_flock import evaluate, load_policy
 from sb3_flock.evaluation import model_cards
 from sb3_flock.evaluation.model_cards import median_of_seeds, read_card, ship
-from sb3_flock.rl.saving import PolicyError, find_policy, shipped_policies
+from sb3_flock.rl.loading import PolicyError, find_policy, shipped_policies
 from tests.rl.test_training import quiet, tiny, train
 
 SHIPPED = sorted(shipped_policies())

@@ -13,7 +13,7 @@ from sb3_flock import evaluate, load_policy, train
 from sb3_flock.rl.algorithms import ALGORITHMS
 from sb3_flock.rl.config import TrainingConfig
 from sb3_flock.rl.config_io import load_config
-from sb3_flock.rl.saving import PolicyError
+from sb3_flock.rl.loading import PolicyError
 from sb3_flock.rl.training import _cores
 from sb3_flock.settings import UserError
 
