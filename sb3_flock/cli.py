@@ -60,6 +60,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except UserError as error:
         print(f"sb3-flock: {error}", file=sys.stderr)
         return USAGE_ERROR
+    except MemoryError as error:
+        print(f"sb3-flock: not enough memory: {' '.join(str(error).split()) or 'something is too large'}", file=sys.stderr)
+        return FAILED
     except RunError as error:
         print(f"sb3-flock: {error}", file=sys.stderr)
         return FAILED

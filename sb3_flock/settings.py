@@ -8,16 +8,27 @@ from __future__ import annotations
 
 import difflib
 import numbers
+import reprlib
 from collections.abc import Iterable, Mapping
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 _Settings = TypeVar("_Settings", bound="Settings")
 
+Positive = Annotated[float, Field(ge=1e-6, le=1e6)]
+"""Lengths, speeds, weights: so far from the ends of the floating point numbers that no formula here overflows."""
+NotNegative = Annotated[float, Field(ge=0, le=1e6)]
+
 
 class UserError(ValueError):
-    """Something that the user can mend; the message is one line that says what."""
+    """Something that the user can mend; the message is one line that says what, whatever a file or a flag put into it."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__("".join(letter if letter.isprintable() else "?" for letter in message[:_LONGEST_MESSAGE]))
+
+
+_LONGEST_MESSAGE = 2000
 
 
 class RunError(RuntimeError):
@@ -56,7 +67,7 @@ def check_integer(name: str, value: Any, least: int) -> None:
     :raises SettingsError: if not
     """
     if not isinstance(value, numbers.Integral) or value < least:
-        raise SettingsError(f"{name} = {value!r}: input should be an integer of at least {least}")
+        raise SettingsError(f"{name} = {shown(value)}: input should be an integer of at least {least}")
 
 
 def leaf_paths(settings: type[Settings], prefix: tuple[str, ...] = ()) -> Iterable[tuple[str, ...]]:
@@ -105,4 +116,13 @@ def _describe(settings: type[Settings], error: Mapping[str, Any]) -> str:
     if error["type"] == "value_error":  # raised by a validator of ours, which names the parameter itself
         return str(error["ctx"]["error"])
     message = error["msg"][0].lower() + error["msg"][1:]
-    return f"{path} = {error['input']!r}: {message}"
+    return f"{path} = {shown(error['input'])}: {message}"
+
+
+def shown(value: Any) -> str:
+    """A value as a message shows it: short, even if it is a YAML file's million laughs."""
+    return _short.repr(value)
+
+
+_short = reprlib.Repr()
+_short.maxstring = _short.maxother = _short.maxlong = 200

@@ -172,7 +172,7 @@ def test_the_command_is_installed_and_help_needs_no_torch():
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
-def test_ctrl_c_leaves_the_model_and_exits_130(tmp_path):
+def test_ctrl_c_leaves_a_checkpoint_and_exits_130(tmp_path):
     words = ["train", "--total-timesteps", "10000000", "--output-dir", str(tmp_path), "--eval-freq", "0", *TINY]
     # A background job inherits an ignored SIGINT, and so would its children: have the handler set as in a terminal.
     code = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
@@ -191,4 +191,4 @@ def test_ctrl_c_leaves_the_model_and_exits_130(tmp_path):
     assert process.returncode == 130
     assert "interrupted" in errors
     assert "Traceback" not in errors
-    assert (tmp_path / "ddpg_3v1o_1" / "final_model.zip").exists()
+    assert len(list((tmp_path / "ddpg_3v1o_1").glob("rl_model_*_steps.zip"))) == 1

@@ -7,6 +7,7 @@ them the state of the training: replay buffer, episodes under way, random stream
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import math
@@ -14,7 +15,7 @@ import platform
 import random
 import zipfile
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -116,7 +117,14 @@ class LoadedCheckpoint:
         return dict(self.state["surroundings"])
 
     def restore_model(self, model: OffPolicyAlgorithm) -> None:
-        """Set the networks, the optimizers, the replay buffer and the episodes under way."""
+        """Set the networks, the optimizers, the replay buffer and the episodes under way.
+
+        :raises PolicyError: if they are not those of this config
+        """
+        with self._fitting():
+            self._restore_model(model)
+
+    def _restore_model(self, model: OffPolicyAlgorithm) -> None:
         parameters = {name.removesuffix(".pth"): tensors for name, tensors in self.tensors.items()}
         for name, value in (parameters.pop("pytorch_variables", None) or {}).items():  # SAC's entropy coefficient
             getattr(model, name).data.copy_(value)
@@ -124,9 +132,20 @@ class LoadedCheckpoint:
         _load_model_state(model, self.state["model"])
 
     def restore_parts(self, parts: Mapping[str, Stateful]) -> None:
-        """Set the callbacks and, last of all, the random streams."""
-        for name, part in parts.items():
-            part.load_state_dict(self.state["parts"][name])
+        """Set the callbacks and, last of all, the random streams.
+
+        :raises PolicyError: if they are not those of this config
+        """
+        with self._fitting():
+            for name, part in parts.items():
+                part.load_state_dict(self.state["parts"][name])
+
+    @contextlib.contextmanager
+    def _fitting(self) -> Iterator[None]:
+        try:
+            yield
+        except (KeyError, IndexError, TypeError, ValueError, AttributeError, RuntimeError, OverflowError) as error:
+            raise PolicyError(f"{self.path}: not a checkpoint of this run's config ({first_line(error)})") from None
 
 
 def newest_checkpoint(

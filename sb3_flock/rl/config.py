@@ -6,10 +6,12 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from sb3_flock.settings import Settings
+from sb3_flock.settings import NotNegative, Positive, Settings
 from sb3_flock.sim import Scenario
+from sb3_flock.sim.scenario import MAX_BODIES
 
 Width = Annotated[int, Field(ge=1, le=65_536)]
+Count = Annotated[int, Field(ge=0, le=10**12)]
 
 
 class NetworkConfig(Settings):
@@ -17,7 +19,7 @@ class NetworkConfig(Settings):
 
     channels: tuple[Width, Width] = Field((16, 32), description="output channels of the two convolutions (open)")
     kernel_size: int = Field(3, ge=1, le=15, description="side of the convolutions' kernels [anchors] (open)")
-    stride: int = Field(2, ge=1, description="stride of the convolutions [anchors] (open)")
+    stride: int = Field(2, ge=1, le=101, description="stride of the convolutions [anchors] (open)")
     features_dim: Width = Field(128, description="width of the dense layer behind the convolutions (open)")
     net_arch: tuple[Width, ...] = Field(
         (64,), max_length=16, description="widths of the hidden layers behind the features (open)"
@@ -37,24 +39,26 @@ class NetworkConfig(Settings):
 class LearnerConfig(Settings):
     """The learning algorithm's parameters, named as in Stable-Baselines3."""
 
-    learning_rate: float = Field(5e-4, gt=0, description="Adam's learning rate at the start (open)")
-    final_learning_rate: float = Field(0.0, ge=0, description="learning rate at the end, reached linearly (open)")
-    batch_size: int = Field(128, ge=1, description="transitions in a minibatch (open)")
-    buffer_size: int = Field(200_000, ge=1, description="transitions the shared replay buffer holds (open)")
-    learning_starts: int = Field(4_000, ge=0, description="transitions flown with random actions before learning (open)")
+    learning_rate: float = Field(5e-4, gt=0, le=1e6, description="Adam's learning rate at the start (open)")
+    final_learning_rate: float = Field(0.0, ge=0, le=1e6, description="learning rate at the end, reached linearly (open)")
+    batch_size: int = Field(128, ge=1, le=1_000_000, description="transitions in a minibatch (open)")
+    buffer_size: int = Field(200_000, ge=1, le=10**9, description="transitions the shared replay buffer holds (open)")
+    learning_starts: Count = Field(4_000, description="transitions flown with random actions before learning (open)")
     gamma: float = Field(0.96, ge=0, lt=1, description="discount factor (open)")
     tau: float = Field(0.005, gt=0, le=1, description="update rate of the target networks (open)")
     mirror: bool = Field(
         True,
         description="mirror half of every minibatch, left for right; not with ddpg-stock or n_steps > 1 (ours; paper: no)",
     )
-    n_steps: int = Field(1, ge=1, description="steps of the return in the critic's target (paper: 1)")
-    train_freq: int = Field(1, ge=1, description="vector steps (one transition a vehicle) between rounds of updates")
-    update_ratio: float = Field(0.4, gt=0, description="updates for each transition flown (paper, Algorithm 1: 1)")
-    noise: float = Field(
-        0.4, ge=0, description="standard deviation of the exploration noise at the start [half the action range] (open)"
+    n_steps: int = Field(1, ge=1, le=1000, description="steps of the return in the critic's target (paper: 1)")
+    train_freq: int = Field(
+        1, ge=1, le=1_000_000, description="vector steps (one transition a vehicle) between rounds of updates"
     )
-    final_noise: float = Field(0.05, ge=0, description="exploration noise at the end, reached linearly (open)")
+    update_ratio: Positive = Field(0.4, description="updates for each transition flown (paper, Algorithm 1: 1)")
+    noise: NotNegative = Field(
+        0.4, description="standard deviation of the exploration noise at the start [half the action range] (open)"
+    )
+    final_noise: NotNegative = Field(0.05, description="exploration noise at the end, reached linearly (open)")
 
 
 class PracticeConfig(Settings):
@@ -70,14 +74,18 @@ class PracticeConfig(Settings):
     vehicles: Width | None = Field(
         4, description="vehicles of a flock; null: the task's. The policy fits any number, and four teach it best (ours)"
     )
-    extra_obstacles: int = Field(1, ge=0, description="obstacles added, where the task has any (ours; paper: 0)")
-    obstacle_arena_ratio: float = Field(
-        0.5, gt=0, description="side of the obstacles' square, relative to the task's (ours; paper: 1)"
+    extra_obstacles: int = Field(
+        1, ge=0, le=MAX_BODIES, description="obstacles added, where the task has any (ours; paper: 0)"
     )
-    time_step_ratio: float = Field(
-        2.0, gt=0, description="sampling period while training, relative to the task's (ours; paper: 1)"
+    obstacle_arena_ratio: Positive = Field(
+        0.5, description="side of the obstacles' square, relative to the task's (ours; paper: 1)"
     )
-    separation_ratio: float = Field(1.06, ge=1, description="minimum separations, relative to the task's (ours; paper: 1)")
+    time_step_ratio: Positive = Field(
+        2.0, description="sampling period while training, relative to the task's (ours; paper: 1)"
+    )
+    separation_ratio: float = Field(
+        1.06, ge=1, le=1e6, description="minimum separations, relative to the task's (ours; paper: 1)"
+    )
 
 
 class TrainingConfig(Settings):
@@ -96,20 +104,29 @@ class TrainingConfig(Settings):
     learner: LearnerConfig = Field(default_factory=LearnerConfig, description="the learner")
     network: NetworkConfig = Field(default_factory=NetworkConfig, description="the networks")
 
-    total_timesteps: int = Field(300_000, ge=1, description="transitions to train for")
-    n_flocks: int = Field(32, ge=1, description="flocks flown side by side")
-    num_cpus: int = Field(0, ge=0, description="SuperSuit worker processes; 0: fly in the training process (faster)")
+    total_timesteps: int = Field(300_000, ge=1, le=10**12, description="transitions to train for")
+    n_flocks: Width = Field(32, description="flocks flown side by side")
+    num_cpus: int = Field(
+        0, ge=0, le=1024, description="SuperSuit worker processes; 0: fly in the training process (faster)"
+    )
     seed: int = Field(0, ge=0, le=2**32 - 1, description="seed of the networks, the noise and the flocks")
     device: str = Field("cpu", description="torch device: cpu, cuda, cuda:0, ... or auto")
     torch_threads: int = Field(
-        0, ge=0, description="torch threads; 0: one for batches under 1024, where more gain nothing, else one for each core"
+        0,
+        ge=0,
+        le=1024,
+        description="torch threads; 0: one for batches under 1024, where more gain nothing, else one for each core",
     )
 
-    eval_freq: int = Field(10_000, ge=0, description="transitions between evaluations; 0: none")
-    eval_episodes: int = Field(100, ge=1, description="episodes of an evaluation, the same ones every time")
-    test_episodes: int = Field(1000, ge=1, description="episodes of the table that `sb3-flock train` prints at the end")
-    save_freq: int = Field(25_000, ge=0, description="transitions between checkpoints; 0: none")
-    keep_checkpoints: int = Field(2, ge=1, description="newest checkpoints that are kept; `train --resume` goes on from one")
+    eval_freq: Count = Field(10_000, description="transitions between evaluations; 0: none")
+    eval_episodes: int = Field(100, ge=1, le=1_000_000, description="episodes of an evaluation, the same ones every time")
+    test_episodes: int = Field(
+        1000, ge=1, le=1_000_000, description="episodes of the table that `sb3-flock train` prints at the end"
+    )
+    save_freq: Count = Field(25_000, description="transitions between checkpoints; 0: none")
+    keep_checkpoints: int = Field(
+        2, ge=1, le=1_000_000, description="newest checkpoints that are kept; `train --resume` goes on from one"
+    )
     init_from: str | None = Field(None, description="policy (zip or run folder) whose weights to start from")
     output_dir: str = Field("runs", description="folder of the run folders")
 

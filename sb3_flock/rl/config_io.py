@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import yaml
 
-from sb3_flock.settings import Settings, SettingsError, nearest, resolve_path
+from sb3_flock.settings import Settings, SettingsError, nearest, resolve_path, shown
 
 _Settings = TypeVar("_Settings", bound=Settings)
 
@@ -107,5 +107,5 @@ def _check_groups(settings: type[Settings], values: Mapping[str, Any], prefix: s
         group = field.annotation
         if isinstance(group, type) and issubclass(group, Settings):
             if not isinstance(value, Mapping):
-                raise SettingsError(f"{prefix}{name} = {value!r}: a mapping of parameters is needed")
+                raise SettingsError(f"{prefix}{name} = {shown(value)}: a mapping of parameters is needed")
             _check_groups(group, value, f"{prefix}{name}.")

@@ -310,6 +310,6 @@ def _numbers(text: str) -> list[float]:
 
 
 def first_line(error: Exception) -> str:
-    """An error's first line, without whatever a stranger's file could do to a terminal."""
+    """An error's first line, of a bearable length."""
     lines = str(error).strip().splitlines()
-    return "".join(letter if letter.isprintable() else "?" for letter in lines[0][:200]) if lines else type(error).__name__
+    return lines[0][:200] if lines else type(error).__name__

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydantic import Field
 
-from sb3_flock.settings import Settings
+from sb3_flock.settings import NotNegative, Positive, Settings
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -20,21 +20,21 @@ if TYPE_CHECKING:
 class RewardWeights(Settings):
     """The weights of the reward. Those the paper does not name are 1, its plain sum, in ``configs/paper_plain.yaml``."""
 
-    link_bonus: float = Field(0.5, ge=0, description="reward for each neighbor at a safe distance (paper, IV-B: 1)")
-    separation_penalty: float = Field(
-        6.0, ge=0, description="penalty for each neighbor nearer than neighbor_separation (paper, IV-B: 1)"
+    link_bonus: NotNegative = Field(0.5, description="reward for each neighbor at a safe distance (paper, IV-B: 1)")
+    separation_penalty: NotNegative = Field(
+        6.0, description="penalty for each neighbor nearer than neighbor_separation (paper, IV-B: 1)"
     )
-    obstacle_penalty: float = Field(
-        12.0, ge=0, description="penalty for each obstacle nearer than obstacle_separation (paper, IV-B: 1)"
+    obstacle_penalty: NotNegative = Field(
+        12.0, description="penalty for each obstacle nearer than obstacle_separation (paper, IV-B: 1)"
     )
-    epsilon: float = Field(10.0, ge=0, description="weight of the distance to the waypoint [1/m] (paper leaves it open)")
+    epsilon: NotNegative = Field(10.0, description="weight of the distance to the waypoint [1/m] (paper leaves it open)")
     beta: float = Field(
-        -0.02, le=0, description="weight of the squared action [m/s, rad/s], not positive (paper leaves it open)"
+        -0.02, ge=-1e6, le=0, description="weight of the squared action [m/s, rad/s], not positive (paper leaves it open)"
     )
     lambda_: float = Field(
         0.7, ge=0, le=1, description="share of a vehicle's own reward in the mix with its neighbors' (open)"
     )
-    scale: float = Field(0.02, gt=0, description="factor on the sum of the four terms (ours; paper: 1)")
+    scale: Positive = Field(0.02, description="factor on the sum of the four terms (ours; paper: 1)")
 
 
 def reward_terms(sensing: Sensing, actions: NDArray[np.float64], scenario: Scenario) -> dict[str, NDArray[np.float64]]:

@@ -7,7 +7,7 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from sb3_flock.settings import Settings
+from sb3_flock.settings import NotNegative, Positive, Settings
 from sb3_flock.sim.reward import RewardWeights
 
 MAX_BODIES = 1_000_000
@@ -25,43 +25,43 @@ class Scenario(Settings):
 
     n_vehicles: int = Field(3, ge=1, le=MAX_BODIES, description="number of vehicles n (paper, V: 3 or 5)")
     n_obstacles: int = Field(1, ge=0, le=MAX_BODIES, description="number of randomly walking obstacles (paper, V: 1 or 2)")
-    max_cycles: int = Field(200, ge=1, description="episode length T [steps] (paper leaves it open)")
-    time_step: float = Field(0.1, gt=0, description="sampling period [s] (paper, V)")
+    max_cycles: int = Field(200, ge=1, le=1_000_000, description="episode length T [steps] (paper leaves it open)")
+    time_step: Positive = Field(0.1, description="sampling period [s] (paper, V)")
 
-    max_speed: float = Field(0.15, gt=0, description="top speed of a vehicle [m/s] (paper, V)")
-    max_turn_rate: float = Field(math.pi, gt=0, description="bound of a vehicle's turn rate omega [rad/s] (open)")
-    obstacle_max_speed: float = Field(0.1, ge=0, description="top speed of an obstacle [m/s] (paper, V)")
-    obstacle_turn_std: float = Field(
-        2.0, ge=0, description="standard deviation of an obstacle's turn rate, drawn each step [rad/s] (open)"
+    max_speed: Positive = Field(0.15, description="top speed of a vehicle [m/s] (paper, V)")
+    max_turn_rate: Positive = Field(math.pi, description="bound of a vehicle's turn rate omega [rad/s] (open)")
+    obstacle_max_speed: NotNegative = Field(0.1, description="top speed of an obstacle [m/s] (paper, V)")
+    obstacle_turn_std: NotNegative = Field(
+        2.0, description="standard deviation of an obstacle's turn rate, drawn each step [rad/s] (open)"
     )
-    waypoint_speed: float = Field(0.1, ge=0, description="speed of the waypoint towards the origin [m/s] (paper, V)")
+    waypoint_speed: NotNegative = Field(0.1, description="speed of the waypoint towards the origin [m/s] (paper, V)")
 
     obstacle_motion: Literal["walk", "crossing"] = Field(
         "walk",
         description="walk: at random (paper, V); crossing: straight through the flock from its far side (ours)",
     )
 
-    arena: float = Field(1.0, gt=0, description="half side of the square in which all bodies start [m] (paper, V)")
-    obstacle_arena: float | None = Field(
-        None, gt=0, description="half side of the square in which obstacles start and walk [m]; null: arena (paper, V)"
+    arena: Positive = Field(1.0, description="half side of the square in which all bodies start [m] (paper, V)")
+    obstacle_arena: Positive | None = Field(
+        None, description="half side of the square in which obstacles start and walk [m]; null: arena (paper, V)"
     )
-    link_range: float = Field(0.15, gt=0, description="proximity network threshold r_n [m] (paper, V)")
-    neighbor_separation: float = Field(0.1, ge=0, description="minimum separation to neighbors r_n' [m] (paper, V)")
-    detection_range: float = Field(0.25, gt=0, description="obstacle detection range r_o [m] (paper, V)")
-    obstacle_separation: float = Field(0.15, ge=0, description="minimum separation to obstacles r_o' [m] (paper, V)")
+    link_range: Positive = Field(0.15, description="proximity network threshold r_n [m] (paper, V)")
+    neighbor_separation: NotNegative = Field(0.1, description="minimum separation to neighbors r_n' [m] (paper, V)")
+    detection_range: Positive = Field(0.25, description="obstacle detection range r_o [m] (paper, V)")
+    obstacle_separation: NotNegative = Field(0.15, description="minimum separation to obstacles r_o' [m] (paper, V)")
 
     n_anchors: int = Field(11, ge=2, le=101, description="anchors per side l of each tensor channel (paper, IV-A: 11)")
-    neighbor_radius: float | None = Field(
-        None, gt=0, description="half width of the neighbor channel [m]; null: link_range (paper, IV-A: r_c)"
+    neighbor_radius: Positive | None = Field(
+        None, description="half width of the neighbor channel [m]; null: link_range (paper, IV-A: r_c)"
     )
-    obstacle_radius: float | None = Field(
-        None, gt=0, description="half width of the obstacle channel [m]; null: detection_range (paper, IV-A)"
+    obstacle_radius: Positive | None = Field(
+        None, description="half width of the obstacle channel [m]; null: detection_range (paper, IV-A)"
     )
-    goal_radius: float = Field(
-        0.3, gt=0, description="half width r_g of the goal channel [m]; a farther waypoint shows on its circle (open)"
+    goal_radius: Positive = Field(
+        0.3, description="half width r_g of the goal channel [m]; a farther waypoint shows on its circle (open)"
     )
     anchor_width: float = Field(
-        1.0, ge=0.1, description="standard deviation sigma of the anchors' Gaussian [anchor spacings] (open)"
+        1.0, ge=0.1, le=1e6, description="standard deviation sigma of the anchors' Gaussian [anchor spacings] (open)"
     )
 
     reward: RewardWeights = Field(default_factory=RewardWeights, description="weights of the reward (paper, IV-B)")
