@@ -26,9 +26,8 @@ def read_card(name: str) -> dict[str, Any]:
 def median_of_seeds(card: dict[str, Any]) -> dict[str, float]:
     """The median over the trainings of each metric on record."""
     seeds = [seed["metrics"] for seed in card["seeds"]]
-    return {
-        name: float(np.median([metrics[name] for metrics in seeds])) for name in seeds[0] if None not in seeds[0].values()
-    }
+    columns = {name: [metrics[name] for metrics in seeds] for name in seeds[0]}
+    return {name: float(np.median(values)) for name, values in columns.items() if None not in values}
 
 
 def ship(name: str, runs: Sequence[str | Path], folder: str | Path, episodes: int = 1000) -> Path:
