@@ -10,7 +10,7 @@ import difflib
 import numbers
 import reprlib
 from collections.abc import Iterable, Mapping
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar, get_origin
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -70,13 +70,20 @@ def check_integer(name: str, value: Any, least: int) -> None:
         raise SettingsError(f"{name} = {shown(value)}: input should be an integer of at least {least}")
 
 
+def group_of(annotation: Any) -> type[Settings] | None:
+    """The settings class that a field holds, or ``None`` for a parameter."""
+    is_class = isinstance(annotation, type) and get_origin(annotation) is None  # Python 3.10 takes tuple[int] for a class
+    return annotation if is_class and issubclass(annotation, Settings) else None
+
+
 def leaf_paths(settings: type[Settings], prefix: tuple[str, ...] = ()) -> Iterable[tuple[str, ...]]:
     """Every parameter of a settings class as a path of names, groups opened."""
     for name, field in settings.model_fields.items():
-        if isinstance(field.annotation, type) and issubclass(field.annotation, Settings):
-            yield from leaf_paths(field.annotation, (*prefix, name))
-        else:
+        group = group_of(field.annotation)
+        if group is None:
             yield (*prefix, name)
+        else:
+            yield from leaf_paths(group, (*prefix, name))
 
 
 def resolve_path(settings: type[Settings], key: str) -> tuple[str, ...]:

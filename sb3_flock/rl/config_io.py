@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import yaml
 
-from sb3_flock.settings import Settings, SettingsError, nearest, resolve_path, shown
+from sb3_flock.settings import Settings, SettingsError, group_of, nearest, resolve_path, shown
 
 _Settings = TypeVar("_Settings", bound=Settings)
 
@@ -104,8 +104,8 @@ def _check_groups(settings: type[Settings], values: Mapping[str, Any], prefix: s
         if field is None:
             hint = nearest(str(name), settings.model_fields)
             raise SettingsError(f"{prefix}{name} is not a parameter{hint}")
-        group = field.annotation
-        if isinstance(group, type) and issubclass(group, Settings):
+        group = group_of(field.annotation)
+        if group is not None:
             if not isinstance(value, Mapping):
                 raise SettingsError(f"{prefix}{name} = {shown(value)}: a mapping of parameters is needed")
             _check_groups(group, value, f"{prefix}{name}.")
