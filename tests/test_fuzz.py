@@ -21,7 +21,7 @@ from sb3_flock.rl.loading import PolicyError
 from sb3_flock.settings import SettingsError, leaf_paths
 from tests.rl.test_saving import CONFIG
 
-FEW, MANY = 150, 10_000
+FEW, MANY = 100, 10_000
 
 
 def examples(count):

@@ -2,6 +2,7 @@
 
 import io
 import json
+import signal
 import zipfile
 
 import numpy as np
@@ -164,16 +165,18 @@ def test_a_training_can_start_from_trained_weights(tmp_path):
 
 
 def test_an_interrupted_training_leaves_its_model(tmp_path):
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job inherits an ignored one
     from stable_baselines3.common.callbacks import BaseCallback
 
     class Interrupt(BaseCallback):
         def _on_step(self):
             if self.num_timesteps >= 100:
-                raise KeyboardInterrupt
+                signal.raise_signal(signal.SIGINT)
             return True
 
     with pytest.raises(KeyboardInterrupt):
         train(tiny(tmp_path), quiet(), callbacks=[Interrupt()])
+    assert signal.signal(signal.SIGINT, handler) is signal.default_int_handler  # as it was
     assert load_policy(tmp_path / "runs" / "ddpg_3v1o_1").num_timesteps == 102
 
 

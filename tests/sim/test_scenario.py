@@ -23,7 +23,7 @@ def test_the_defaults_are_the_papers_numbers_where_it_gives_them():
         ({"n_vehicles": 0}, ["n_vehicles", "0", "greater than or equal to 1"]),
         ({"n_obstacles": -1}, ["n_obstacles", "-1", "greater than or equal to 0"]),
         ({"max_speed": float("nan")}, ["max_speed", "nan", "finite"]),
-        ({"time_step": 0}, ["time_step", "0", "greater than 0"]),
+        ({"time_step": 0}, ["time_step", "0", "greater than or equal to 0.000001"]),
         ({"n_anchors": 2.5}, ["n_anchors", "2.5", "integer"]),
         ({"n_vehicles": "many"}, ["n_vehicles", "many", "integer"]),
         ({"link_range": 0.05}, ["neighbor_separation", "0.1", "at most", "link_range", "0.05"]),
