@@ -114,9 +114,11 @@ def resume(
     with Signals().waiting() as signals, locked(folder):
         checkpoint = newest_checkpoint(folder, config, tell)
         done = checkpoint.num_timesteps if checkpoint else 0
-        if done >= config.total_timesteps and (folder / "final_model.zip").exists():
+        is_complete = done >= config.total_timesteps and (folder / "final_model.zip").exists()
+        if is_complete or ("total_timesteps" in (changes or {}) and done >= config.total_timesteps):
             raise SettingsError(
-                f"resume {folder}: the run is complete with {done} transitions; a larger total_timesteps is needed to go on"
+                f"resume {folder}: {done} transitions are flown; a larger total_timesteps than {config.total_timesteps} is "
+                "needed to go on"
             )
         model, env = _prepare(config)
         try:

@@ -1,3 +1,4 @@
+import csv
 import functools
 
 import numpy as np
@@ -5,8 +6,12 @@ import pytest
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_flock.rl.checkpoints import LoadedCheckpoint, checkpoint_paths
+from sb3_flock.rl.checkpoints import LoadedCheckpoint, inexactness
+from sb3_flock.rl.config import TrainingConfig
+from sb3_flock.rl.config_io import load_config, to_yaml
+from sb3_flock.rl.loading import PolicyError, checkpoint_paths
 from sb3_flock.rl.training import resume, train
+from sb3_flock.settings import SettingsError
 from tests.rl.test_training import quiet, tiny
 
 
@@ -73,3 +78,40 @@ def test_a_resumed_run_ends_like_one_never_interrupted_to_the_last_bit(tmp_path,
     assert len(ours) > 100
     for name, value in ours.items():
         np.testing.assert_array_equal(value, theirs[name], err_msg=name)
+
+
+def test_a_complete_run_goes_on_only_with_more_transitions(tmp_path):
+    first = train(tiny(tmp_path), quiet())
+    for changes in (None, {"total_timesteps": 100}, {"total_timesteps": 300}):
+        with pytest.raises(SettingsError, match="a larger total_timesteps"):
+            resume(first.folder, quiet(), changes)
+    with pytest.raises(SettingsError, match="seed cannot change"):
+        resume(first.folder, quiet(), {"seed": 1})
+    with pytest.raises(SettingsError, match="not a run folder"):
+        resume(tmp_path, quiet())
+    longer = resume(first.folder, quiet(), {"total_timesteps": 420}, command=["sb3-flock", "train", "--resume"])
+    assert longer.model.num_timesteps == 420
+    assert load_config(TrainingConfig, first.folder / "config.yaml").total_timesteps == 420
+    assert np.load(first.folder / "evaluations.npz")["timesteps"].tolist() == [120, 240, 300, 360, 420]
+    assert (first.folder / "command.txt").read_text().endswith("\nsb3-flock train --resume\n")
+    with open(first.folder / "progress.csv") as file:
+        steps = [int(row["time/total_timesteps"]) for row in csv.DictReader(file)]
+    assert steps == sorted(steps)
+    assert {120, 300, 420} <= set(steps)
+
+
+def test_other_surroundings_are_told(tmp_path):
+    first = train(tiny(tmp_path), quiet())
+    checkpoint = LoadedCheckpoint(checkpoint_paths(first.folder)[-1], 10**9)
+    assert inexactness(checkpoint, first.config) == ""
+    checkpoint.state["surroundings"]["torch"] = "1.0"
+    assert "; not bit-exact: torch 1.0 then, " in inexactness(checkpoint, first.config)
+    assert "workers start new episodes" in inexactness(checkpoint, first.config.replace(num_cpus=2))
+
+
+def test_a_checkpoint_of_another_config_is_refused(tmp_path):
+    first = train(tiny(tmp_path), quiet())
+    wider = tiny(tmp_path, features_dim=24, total_timesteps=900)
+    (first.folder / "config.yaml").write_text(to_yaml(wider))
+    with pytest.raises(PolicyError, match="not a checkpoint of this run's config"):
+        resume(first.folder, quiet())
