@@ -287,7 +287,7 @@ def _evaluate_and_print(flyer: Any, name: str, scenario: Any, episodes: int, see
     for warning in caught:
         print(f"sb3-flock: warning: {warning.message}", file=sys.stderr)
     print(f"{name}:")
-    print(f"{scenario.n_vehicles} vehicles, {scenario.n_obstacles} obstacles, {episodes} episodes, seed {seed}")
+    print(f"{scenario.bodies}, {episodes} episodes, seed {seed}")
     RichConsole().print(metrics_table(metrics, scenario))
     return metrics
 

@@ -26,8 +26,12 @@ from sb3_flock.rl.saving import versions
 from sb3_flock.settings import SettingsError
 from sb3_flock.sim import Scenario
 
-SETTINGS = {"paper-3v1o": (3, 1), "paper-5v1o": (5, 1), "paper-5v2o": (5, 2)}
-"""The paper's experiments: the shipped policy's name, its vehicles and obstacles."""
+SETTINGS = {
+    "paper-3v1o": Scenario(n_vehicles=3, n_obstacles=1),
+    "paper-5v1o": Scenario(n_vehicles=5, n_obstacles=1),
+    "paper-5v2o": Scenario(n_vehicles=5, n_obstacles=2),
+}
+"""The paper's experiments by the shipped policy's name."""
 
 FLEETS = (1, 2, 3, 5, 8, 12, 20, 50, 200)
 """Vehicles that the general policy is flown with."""
@@ -78,12 +82,12 @@ def reproduce(out: str | Path, quick: bool = False, console: Console | None = No
     parts = [_head(size)]
     with console.status("") as status:
         tables: dict[str, Any] = {}
-        for name, setup in SETTINGS.items():
-            status.update(f"{setup[0]} vehicles, {setup[1]} obstacles: {size.episodes} episodes of each controller")
-            tables[name] = _fly_all(policies[name], Scenario(n_vehicles=setup[0], n_obstacles=setup[1]), size.episodes)
+        for name, scenario in SETTINGS.items():
+            status.update(f"{scenario.bodies}: {size.episodes} episodes of each controller")
+            tables[name] = _fly_all(policies[name], scenario, size.episodes)
         parts.append(_tables(tables))
         status.update("a hard test: crossing obstacles")
-        crossing = Scenario(n_vehicles=5, n_obstacles=2, obstacle_motion="crossing")
+        crossing = SETTINGS["paper-5v2o"].replace(obstacle_motion="crossing")
         parts.append(_crossing(_fly_all(policies["paper-5v2o"], crossing, size.episodes)))
         status.update("figures")
         parts.append(_flight_figures(folder, policies["paper-5v2o"]))
@@ -122,9 +126,9 @@ def _tables(tables: dict[str, dict[str, dict[str, Metric]]]) -> str:
     """Tables I and II with our rows and the peers'."""
     parts = ["## Tables I and II"]
     for name, rows in tables.items():
-        n_vehicles, n_obstacles = SETTINGS[name]
-        lines_ = [f"{n_vehicles} vehicles, {n_obstacles} obstacles (`{name}`):\n", *_header()]
-        for table, figures in PAPER[(n_vehicles, n_obstacles)].items():
+        scenario = SETTINGS[name]
+        lines_ = [f"{scenario.bodies} (`{name}`):\n", *_header()]
+        for table, figures in PAPER[scenario.n_vehicles, scenario.n_obstacles].items():
             lines_.append(_row(f"paper, {table}", figures))
         card = read_card(name)
         trainings = len(card["seeds"])
@@ -176,12 +180,12 @@ def _flight_figures(folder: Path, policy: LoadedPolicy) -> str:
 def _training_curve(folder: Path) -> str:
     """The return of the evaluations during the trainings on record, by flock episodes practiced."""
     series = {}
-    for name, (n_vehicles, n_obstacles) in SETTINGS.items():
+    for name, scenario in SETTINGS.items():
         seeds = read_card(name)["seeds"]
         steps = load_policy(name).config.flown_scenario()
         episodes = np.array(seeds[0]["curve"]["timesteps"]) / (steps.n_vehicles * steps.max_cycles)
         returns = np.array([seed["curve"]["return"] for seed in seeds])
-        series[f"{n_vehicles} vehicles, {n_obstacles} obstacles"] = (episodes, returns)
+        series[scenario.bodies] = (episodes, returns)
     save(lines(series, "episodes of a flock practiced", "return of a vehicle, 100 episodes"), folder / "training")
     return (
         "## Training curves\n\n![return against episodes](training.png)\n\nThe line is the median over the trainings, the shade "

@@ -96,7 +96,7 @@ def test_evaluate_flies_a_hand_written_law_too(tmp_path, capsys):
     file = tmp_path / "result.json"
     words = ["evaluate", "--controller", "olfati-saber", "--n-vehicles", "4", "--scenario", "crossing", "--episodes", "2"]
     assert main([*words, "--json", str(file)]) == 0
-    assert "olfati-saber:\n4 vehicles, 1 obstacles" in capsys.readouterr().out
+    assert "olfati-saber:\n4 vehicles, 1 obstacle," in capsys.readouterr().out
     meta = json.loads(file.read_text())["meta"]
     assert meta["controller"] == "olfati-saber"
     assert meta["scenario"]["obstacle_motion"] == "crossing"

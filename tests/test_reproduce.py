@@ -25,9 +25,9 @@ def test_every_table_and_figure_is_written_and_linked(results):
         assert (results / f"{stem}.png").stat().st_size > 10_000
         assert (results / f"{stem}.svg").stat().st_size > 5_000
     rows = [line for line in page.splitlines() if line.startswith("| ")]
-    for name, setup in SETTINGS.items():
-        assert f"{setup[0]} vehicles, {setup[1]} obstacles (`{name}`)" in page
-        for figures in PAPER[setup].values():
+    for name, scenario in SETTINGS.items():
+        assert f"{scenario.bodies} (`{name}`)" in page
+        for figures in PAPER[scenario.n_vehicles, scenario.n_obstacles].values():
             assert any(f"{figures['tracking_error']:.3f}" in row and "paper" in row for row in rows)
     for label in ("`random`", "`go-to-waypoint`", "`olfati-saber`", "`orca`", "ours, the shipped one, flown now"):
         assert sum(row.startswith(f"| {label} |") for row in rows) == len(SETTINGS) + 1  # and the crossing obstacles

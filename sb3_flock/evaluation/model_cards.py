@@ -60,7 +60,7 @@ def ship(name: str, runs: Sequence[str | Path], folder: str | Path, episodes: in
     scenario = shipped.scenario
     card = {
         "name": name,
-        "task": f"{scenario.n_vehicles} vehicles, {scenario.n_obstacles} obstacles ({scenario.obstacle_motion})",
+        "task": f"{scenario.bodies} ({scenario.obstacle_motion})",
         "shipped_seed": shipped.config.seed,
         "episodes": episodes,
         "check": {"episodes": CHECK_EPISODES, "seed": CHECK_SEED, "tracking_error": check},

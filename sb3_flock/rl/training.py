@@ -237,7 +237,7 @@ def _build(config: TrainingConfig, env: VecEnv) -> OffPolicyAlgorithm:
 def _summary(config: TrainingConfig, flown: Scenario, model: OffPolicyAlgorithm, folder: Path) -> str:
     """What is trained, on what, where: one line."""
     return (
-        f"{config.algo} for {config.scenario.n_vehicles} vehicles, {config.scenario.n_obstacles} obstacles; practice in "
+        f"{config.algo} for {config.scenario.bodies}; practice in "
         f"{config.n_flocks} flocks of {flown.n_vehicles} among {flown.n_obstacles}; device {model.device}, "
         f"torch threads {th.get_num_threads()} on {_cores()} cores; {folder}"
     )

@@ -88,6 +88,12 @@ class Scenario(Settings):
         )
 
     @property
+    def bodies(self) -> str:
+        """How many fly and walk, in words: ``5 vehicles, 2 obstacles``."""
+        counts = ((self.n_vehicles, "vehicle"), (self.n_obstacles, "obstacle"))
+        return ", ".join(f"{count} {name}{'' if count == 1 else 's'}" for count, name in counts)
+
+    @property
     def observation_shape(self) -> tuple[int, int, int]:
         """Shape of one vehicle's tensor, ``(3, l, l)``."""
         return (3, self.n_anchors, self.n_anchors)

@@ -68,3 +68,8 @@ def test_every_parameter_says_what_it_means():
     for settings in (Scenario, RewardWeights):
         for name, field in settings.model_fields.items():
             assert field.description, name
+
+
+def test_its_bodies_in_words():
+    assert Scenario().bodies == "3 vehicles, 1 obstacle"
+    assert Scenario(n_vehicles=1, n_obstacles=0).bodies == "1 vehicle, 0 obstacles"
