@@ -19,7 +19,7 @@ from sb3_flock.rl.algorithms import build_model
 from sb3_flock.rl.config_io import load_config, to_yaml
 from sb3_flock.rl.loading import PolicyError
 from sb3_flock.settings import SettingsError, leaf_paths
-from tests.rl.test_saving import CONFIG
+from tests.rl.conftest import CONFIG
 
 FEW, MANY = 100, 10_000
 

@@ -15,20 +15,9 @@ import pytest
 import torch as th
 from stable_baselines3 import DDPG, TD3
 
-from sb3_flock import FlockCNN, FlockPolicy, load_policy, make_vec_env, save_model
-from sb3_flock.rl.algorithms import build_model
+from sb3_flock import FlockCNN, FlockPolicy, load_policy, make_vec_env
 from sb3_flock.rl.loading import PolicyError
-from tests.rl.test_saving import CONFIG
-
-
-@pytest.fixture(scope="module")
-def model():
-    return build_model(CONFIG, make_vec_env(CONFIG.scenario, 1, seed=0))
-
-
-@pytest.fixture
-def saved(model, tmp_path):
-    return save_model(model, tmp_path / "policy.zip", CONFIG)
+from tests.rl.conftest import CONFIG
 
 
 def rewrite(path, changes):
