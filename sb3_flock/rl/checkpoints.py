@@ -38,8 +38,6 @@ from sb3_flock.sim.backend import compiled
 _VALUES = "training.json"
 _ARRAYS = "training/"
 _MODEL_STATE = ("num_timesteps", "_episode_num", "_n_updates", "_current_progress_remaining")
-
-
 _MOST_BESIDES = 2**28
 """Bytes that anything but the replay buffer may have."""
 

@@ -56,7 +56,6 @@ class Checkpoints(BaseCallback):
         steps, freq = self.num_timesteps, self.config.save_freq
         if self.signals.caught is not None:
             self._save()
-
             self.signals.act()
         elif freq and steps // freq > self._last // freq:
             self._save()
@@ -104,7 +103,7 @@ class Signals:
 
     @contextlib.contextmanager
     def waiting(self) -> Iterator[Signals]:
-        """Keep signals while it lasts."""
+        """Keep signals while it lasts; one that nobody has acted upon by its end acts then."""
         if threading.current_thread() is not threading.main_thread():
             yield self
             return
@@ -117,6 +116,8 @@ class Signals:
         finally:
             for number, handler in taken.items():
                 signal.signal(number, handler)
+        if self.caught is not None:
+            self.act()
 
     def _keep(self, number: int, frame: FrameType | None) -> None:
         if self.caught is not None:

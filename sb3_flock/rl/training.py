@@ -112,6 +112,8 @@ def resume(
         console.print(line, soft_wrap=True, highlight=False)
 
     with Signals().waiting() as signals, locked(folder):
+        for half_written in folder.glob(".*.tmp"):
+            half_written.unlink()
         checkpoint = newest_checkpoint(folder, config, tell)
         done = checkpoint.num_timesteps if checkpoint else 0
         is_complete = done >= config.total_timesteps and (folder / "final_model.zip").exists()

@@ -1,5 +1,6 @@
 import csv
 import functools
+import signal
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from sb3_flock.rl.checkpoints import LoadedCheckpoint, inexactness
 from sb3_flock.rl.config import TrainingConfig
 from sb3_flock.rl.config_io import load_config, to_yaml
 from sb3_flock.rl.loading import PolicyError, checkpoint_paths
+from sb3_flock.rl.safety import Signals
 from sb3_flock.rl.training import resume, train
 from sb3_flock.settings import SettingsError
 from tests.rl.test_training import quiet, tiny
@@ -89,8 +91,11 @@ def test_a_complete_run_goes_on_only_with_more_transitions(tmp_path):
         resume(first.folder, quiet(), {"seed": 1})
     with pytest.raises(SettingsError, match="not a run folder"):
         resume(tmp_path, quiet())
+    half_written = first.folder / ".rl_model_9_steps.zip.tmp"
+    half_written.write_bytes(b"PK")
     longer = resume(first.folder, quiet(), {"total_timesteps": 420}, command=["sb3-flock", "train", "--resume"])
     assert longer.model.num_timesteps == 420
+    assert not half_written.exists()
     assert load_config(TrainingConfig, first.folder / "config.yaml").total_timesteps == 420
     assert np.load(first.folder / "evaluations.npz")["timesteps"].tolist() == [120, 240, 300, 360, 420]
     assert (first.folder / "command.txt").read_text().endswith("\nsb3-flock train --resume\n")
@@ -115,3 +120,14 @@ def test_a_checkpoint_of_another_config_is_refused(tmp_path):
     (first.folder / "config.yaml").write_text(to_yaml(wider))
     with pytest.raises(PolicyError, match="not a checkpoint of this run's config"):
         resume(first.folder, quiet())
+
+
+def test_a_signal_that_comes_too_late_to_save_is_not_lost():
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job inherits an ignored one
+    ended = False
+    with pytest.raises(KeyboardInterrupt), Signals().waiting() as signals:
+        signal.raise_signal(signal.SIGINT)
+        assert signals.caught == signal.SIGINT
+        ended = True  # it acts at the end of the block
+    assert ended
+    assert signal.signal(signal.SIGINT, handler) is signal.default_int_handler
