@@ -124,10 +124,14 @@ def test_a_checkpoint_of_another_config_is_refused(tmp_path):
 
 def test_a_signal_that_comes_too_late_to_save_is_not_lost():
     handler = signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job inherits an ignored one
-    ended = False
-    with pytest.raises(KeyboardInterrupt), Signals().waiting() as signals:
-        signal.raise_signal(signal.SIGINT)
-        assert signals.caught == signal.SIGINT
-        ended = True  # it acts at the end of the block
-    assert ended
+    waited_for = []
+
+    def work():
+        with Signals().waiting() as signals:
+            signal.raise_signal(signal.SIGINT)
+            waited_for.append(signals.caught)
+
+    with pytest.raises(KeyboardInterrupt):
+        work()
+    assert waited_for == [signal.SIGINT]
     assert signal.signal(signal.SIGINT, handler) is signal.default_int_handler
