@@ -216,8 +216,9 @@ def _rebuild(config: TrainingConfig, weights: Mapping[str, Any], actor_only: boo
 
     :param actor_only: take the actor's weights alone, all that flying needs
     """
-    if not all(isinstance(tensor, th.Tensor) and tensor.layout == th.strided for tensor in weights.values()):
-        raise ValueError("policy.pth holds something else than tensors")
+    for tensor in weights.values():
+        if not isinstance(tensor, th.Tensor) or tensor.layout != th.strided or tensor.is_meta:
+            raise ValueError("policy.pth holds something else than numbers")
     stored = {tensor.untyped_storage().data_ptr(): tensor.untyped_storage().nbytes() // 4 for tensor in weights.values()}
     if _least_parameters(config) > sum(stored.values()):
         raise ValueError(

@@ -197,6 +197,8 @@ def bombs(saved):
     member["config"]["network"].update(wide)
     member["config"]["scenario"]["n_anchors"] = 101
     yield bomb("wide", {"flock.json": json.dumps(member)})
+    promised = tensors({"actor.mu.0.weight": th.empty(2**20, 2**20, device="meta")})
+    yield bomb("promised", {"flock.json": json.dumps(member), "policy.pth": promised})
     yield bomb("deep", {"flock.json": "[" * 10**6})
     yield bomb("digits", {"flock.json": '{"format": ' + "9" * 10**6 + "}"})
     view = th.zeros(1).expand(10**12)
