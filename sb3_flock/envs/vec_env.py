@@ -9,6 +9,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from multiprocessing.connection import wait
 from typing import Any
 
 import numpy as np
@@ -152,6 +153,10 @@ class ParameterSharingVecEnv(SB3VecEnvWrapper):
         except (EOFError, OSError) as error:
             if not self._has_workers:
                 raise  # the env's own
+            ending = wait([proc.sentinel for proc in self.venv.procs], timeout=5)
+            for proc in self.venv.procs:
+                if proc.sentinel in ending:
+                    proc.join(5)  # its pipes close a moment before it is gone
             dead = [f"{proc.pid} (exit code {proc.exitcode})" for proc in self.venv.procs if not proc.is_alive()]
             self.close()
             who = ", ".join(dead) or "unknown"
