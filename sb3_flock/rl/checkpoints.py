@@ -18,7 +18,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol
 
 import numpy as np
 import torch as th
@@ -42,7 +42,6 @@ _MOST_BESIDES = 2**28
 """Bytes that anything but the replay buffer may have."""
 
 
-@runtime_checkable
 class Stateful(Protocol):
     """A part of a training that a checkpoint keeps: plain values and arrays, in dicts and lists."""
 

@@ -219,11 +219,11 @@ def _rebuild(config: TrainingConfig, weights: Mapping[str, Any], actor_only: boo
     for tensor in weights.values():
         if not isinstance(tensor, th.Tensor) or tensor.layout != th.strided or tensor.is_meta:
             raise ValueError("policy.pth holds something else than numbers")
-    stored = {tensor.untyped_storage().data_ptr(): tensor.untyped_storage().nbytes() // 4 for tensor in weights.values()}
-    if _least_parameters(config) > sum(stored.values()):
-        raise ValueError(
-            f"policy.pth holds {sum(stored.values())} numbers, the networks at least {_least_parameters(config)}"
-        )
+    storages = [tensor.untyped_storage() for tensor in weights.values()]
+    stored = sum({storage.data_ptr(): storage.nbytes() // 4 for storage in storages}.values())
+    least = _least_parameters(config)
+    if least > stored:
+        raise ValueError(f"policy.pth holds {stored} numbers, the networks at least {least}")
     policy = _build_policy(config)
     part: nn.Module = policy
     if actor_only:
