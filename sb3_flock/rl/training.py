@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -73,7 +73,7 @@ def train(
         model, env = _prepare(config)
         try:
             folder = new_run_folder(config, command)
-            with locked(folder):
+            with locked(folder), _faults_told(folder):
                 return _run(config, folder, model, None, console, callbacks, signals)
         finally:
             env.close()
@@ -111,7 +111,7 @@ def resume(
     def tell(line: str) -> None:
         console.print(line, soft_wrap=True, highlight=False)
 
-    with Signals().waiting() as signals, locked(folder):
+    with Signals().waiting() as signals, locked(folder), _faults_told(folder):
         for half_written in folder.glob(".*.tmp"):
             half_written.unlink()
         checkpoint = newest_checkpoint(folder, config, tell)
@@ -203,17 +203,24 @@ def _run(
         progress.stop()
         console.print(_go_on(folder), soft_wrap=True, highlight=False)
         raise
-    except OSError as error:
-        where = folder if error.filename is None else os.fsdecode(error.filename)
-        raise RunError(f"{where}: {error.strerror or error}; {_go_on(folder)}") from error
-    except RunError as error:
-        raise RunError(f"{error}; {_go_on(folder)}") from error
     finally:
         progress.stop()
         with contextlib.suppress(OSError):
             model.logger.close()
     best = folder / "best_model.zip"
     return TrainingResult(folder, config, model, best if best.exists() else folder / "final_model.zip")
+
+
+@contextlib.contextmanager
+def _faults_told(folder: Path) -> Iterator[None]:
+    """A fault of the disk or of a worker ends in one line that says how to go on."""
+    try:
+        yield
+    except OSError as error:
+        where = folder if error.filename is None else os.fsdecode(error.filename)
+        raise RunError(f"{where}: {error.strerror or error}; {_go_on(folder)}") from error
+    except RunError as error:
+        raise RunError(f"{error}; {_go_on(folder)}") from error
 
 
 def _go_on(folder: Path) -> str:

@@ -1,6 +1,7 @@
 """Real faults: kills, signals, full disks, dead workers, diverged losses, damaged checkpoints. Each in a process of its own."""
 
 import contextlib
+import ctypes
 import io
 import os
 import random
@@ -204,6 +205,32 @@ def test_a_run_folder_that_is_gone_is_one_line(tmp_path, start):
     code, _, errors = run.end()
     assert code == 1
     assert "No such file or directory" in errors.strip().splitlines()[-1]
+
+
+def obey_permissions():
+    """Drop what lets root write into read-only folders, CAP_DAC_OVERRIDE; others neither have it nor may drop it."""
+    ctypes.CDLL(None).prctl(24, 1)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Linux capabilities")
+def test_a_folder_that_turns_read_only_is_one_line_and_leaves_what_was_saved(tmp_path, start):
+    _, path = config_file(tmp_path)
+    run = start("--config", path, limit=obey_permissions)
+    folder = tmp_path / "runs" / "ddpg_3v1o_1"
+    run.wait_for(200)
+    folder.chmod(0o555)
+    code, _, errors = run.end()
+    assert code == 1
+    whole = newest(folder)
+    last = errors.strip().splitlines()[-1]
+    assert "Permission denied" in last
+    assert f"{whole.path.name} is saved; to go on: sb3-flock train --resume {folder}" in last
+    code, _, errors = start("--resume", folder, limit=obey_permissions).end()
+    assert code == 1
+    assert "Permission denied" in errors.strip().splitlines()[-1]
+    folder.chmod(0o755)
+    code, _, _ = start("--resume", folder, "--total-timesteps", whole.num_timesteps + 60).end()
+    assert code == 0
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
