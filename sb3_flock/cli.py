@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -78,6 +79,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     _add_train(commands)
     _add_evaluate(commands)
+    _add_render(commands)
     _add_reproduce(commands)
     _add_config(commands)
     return parser
@@ -201,18 +203,49 @@ def _add_evaluate(commands: Any) -> None:
         description="Fly a saved policy through many episodes at once and print every metric with its interval.",
         epilog="example: sb3-flock evaluate runs/ddpg_5v2o_1 --n-vehicles 8 --json result.json",
     )
+    _add_flight_flags(parser)
+    parser.add_argument("--episodes", type=_count(1), default=1000, metavar="N", help="episodes to fly [1000]")
+    parser.add_argument("--json", metavar="FILE", help="write the metrics to this file, too")
+    parser.set_defaults(run=_evaluate)
+
+
+def _add_flight_flags(parser: argparse.ArgumentParser) -> None:
+    """Who flies, and where: the same for every command that flies."""
     parser.add_argument("policy", nargs="?", metavar="POLICY", help=_POLICY_HELP)
     parser.add_argument("--controller", metavar="NAME", help=f"fly a hand-written law instead: {', '.join(_CONTROLLERS)}")
     parser.add_argument("--n-vehicles", dest="n_vehicles", metavar="N", help="number of vehicles [as trained]")
     parser.add_argument("--n-obstacles", dest="n_obstacles", metavar="N", help="number of obstacles [as trained]")
     parser.add_argument("--scenario", dest="obstacle_motion", metavar="NAME", help="walk or crossing [as trained]")
-    parser.add_argument("--episodes", type=_count(1), default=1000, metavar="N", help="episodes to fly [1000]")
     parser.add_argument("--seed", type=_count(0), default=0, metavar="N", help="seed of the episodes [0]")
     parser.add_argument("--device", default="cpu", metavar="NAME", help="torch device [cpu]")
-    parser.add_argument("--json", metavar="FILE", help="write the metrics to this file, too")
     parser.add_argument("--trust", action="store_true", help="let SB3 load the policy, which runs any code in the file")
     _add_set(parser, "obstacle_arena=0.5")
-    parser.set_defaults(run=_evaluate)
+
+
+def _flight_of(options: argparse.Namespace) -> tuple[Any, str, Any]:
+    """Who flies, its name, and the scenario."""
+    from sb3_flock.rl.config_io import load_config, parse_overrides
+    from sb3_flock.sim import Scenario
+
+    if (options.policy is None) == (options.controller is None):
+        raise SettingsError(f"{options.command}: a POLICY or --controller NAME is needed, and not both")
+    flyer: Any
+    if options.policy is None:
+        from sb3_flock.evaluation.controllers import make_controller
+
+        flyer, name, trained_for = make_controller(options.controller), options.controller, Scenario()
+    else:
+        from sb3_flock.rl.loading import load_policy
+
+        if options.trust:
+            print("sb3-flock: warning: --trust runs any code that is in the policy file", file=sys.stderr)
+        with _warnings_told():
+            flyer = load_policy(options.policy, options.device, options.trust)
+        name, trained_for = str(flyer.path), flyer.scenario
+    overrides = parse_overrides(options.set)
+    flags = ("n_vehicles", "n_obstacles", "obstacle_motion")
+    overrides.update({key: value for key in flags if (value := getattr(options, key)) is not None})
+    return flyer, name, load_config(Scenario, overrides=overrides, base=trained_for)
 
 
 def _count(least: int) -> Any:
@@ -231,29 +264,9 @@ def _count(least: int) -> Any:
 def _evaluate(options: argparse.Namespace, words: Sequence[str]) -> int:
     from rich.console import Console
 
-    from sb3_flock.rl.config_io import load_config, parse_overrides
-    from sb3_flock.sim import Scenario
-
-    if (options.policy is None) == (options.controller is None):
-        raise SettingsError("evaluate: a POLICY or --controller NAME is needed, and not both")
     if options.json is not None and not Path(options.json).absolute().parent.is_dir():
         raise SettingsError(f"--json {options.json}: there is no folder {Path(options.json).parent}")
-    flyer: Any
-    if options.policy is None:
-        from sb3_flock.evaluation.controllers import make_controller
-
-        flyer, name, trained_for = make_controller(options.controller), options.controller, Scenario()
-    else:
-        from sb3_flock.rl.loading import load_policy
-
-        if options.trust:
-            print("sb3-flock: warning: --trust runs any code that is in the policy file", file=sys.stderr)
-        flyer = load_policy(options.policy, options.device, options.trust)
-        name, trained_for = str(flyer.path), flyer.scenario
-    overrides = parse_overrides(options.set)
-    flags = ("n_vehicles", "n_obstacles", "obstacle_motion")
-    overrides.update({key: value for key in flags if (value := getattr(options, key)) is not None})
-    scenario = load_config(Scenario, overrides=overrides, base=trained_for)
+    flyer, name, scenario = _flight_of(options)
     metrics = _evaluate_and_print(flyer, name, scenario, options.episodes, options.seed, Console(stderr=True))
     if options.json is not None:
         from sb3_flock.evaluation.report import write_json
@@ -281,15 +294,58 @@ def _evaluate_and_print(flyer: Any, name: str, scenario: Any, episodes: int, see
     from sb3_flock.evaluation.report import metrics_table
 
     th.set_num_threads(1)
-    with warnings.catch_warnings(record=True) as caught, console.status(f"flying {episodes} episodes"):
-        warnings.simplefilter("always", UserWarning)
+    with _warnings_told(), console.status(f"flying {episodes} episodes"):
         metrics = evaluate(flyer, scenario, episodes, seed)
-    for warning in caught:
-        print(f"sb3-flock: warning: {warning.message}", file=sys.stderr)
     print(f"{name}:")
     print(f"{scenario.bodies}, {episodes} episodes, seed {seed}")
     RichConsole().print(metrics_table(metrics, scenario))
     return metrics
+
+
+@contextlib.contextmanager
+def _warnings_told() -> Iterator[None]:
+    """Warnings as lines of ours."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", UserWarning)
+        yield
+    for warning in caught:
+        print(f"sb3-flock: warning: {warning.message}", file=sys.stderr)
+
+
+# -- render ----------------------------------------------------------------------------------------------------------
+
+
+def _add_render(commands: Any) -> None:
+    parser = commands.add_parser(
+        "render",
+        help="fly one episode and write a picture, a film or a web page",
+        description="Fly one episode and write it: .gif, .mp4 and .html move, .png and .svg show the paths.",
+        epilog="example: sb3-flock render paper-5v2o --out flight.html --episode 3",
+    )
+    _add_flight_flags(parser)
+    parser.add_argument("--out", required=True, metavar="FILE", help="file to write; its name's end says the kind")
+    parser.add_argument("--episode", type=_count(0), default=0, metavar="N", help="number of the seed's episode [0]")
+    parser.add_argument("--speed", type=float, default=2.0, metavar="X", help="times real time [2]")
+    parser.set_defaults(run=_render)
+
+
+def _render(options: argparse.Namespace, words: Sequence[str]) -> int:
+    import torch as th
+    from rich.console import Console
+
+    from sb3_flock.evaluation.film import check_film, render
+
+    check_film(Path(options.out), options.speed)
+    flyer, name, scenario = _flight_of(options)
+    th.set_num_threads(1)
+    title = f"{options.policy or name}: {scenario.bodies}, episode {options.episode} of seed {options.seed}"
+    with _warnings_told(), Console(stderr=True).status("flying"):
+        try:
+            path = render(flyer, scenario, options.out, options.seed, options.episode, options.speed, title)
+        except OSError as error:
+            raise SettingsError(f"--out {options.out}: {error.strerror or error}") from None
+    print(path)
+    return 0
 
 
 # -- reproduce -------------------------------------------------------------------------------------------------------

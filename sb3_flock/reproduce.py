@@ -13,7 +13,7 @@ from rich.console import Console
 
 from sb3_flock.envs.vec_env import make_vec_env
 from sb3_flock.evaluation.controllers import CONTROLLERS, make_controller
-from sb3_flock.evaluation.episodes import PolicyController, evaluate
+from sb3_flock.evaluation.episodes import evaluate
 from sb3_flock.evaluation.figures import check_matplotlib, lines, observation, record, save, trajectories
 from sb3_flock.evaluation.metrics import Metric
 from sb3_flock.evaluation.model_cards import median_of_seeds, read_card
@@ -169,7 +169,7 @@ def _row(label: str, values: dict[str, Any]) -> str:
 
 
 def _flight_figures(folder: Path, policy: LoadedPolicy) -> str:
-    save(trajectories(record(PolicyController(policy), policy.scenario, seed=0, episode=1)), folder / "trajectories")
+    save(trajectories(record(policy, policy.scenario, seed=0, episode=1)), folder / "trajectories")
     save(observation(policy.scenario), folder / "observation")
     return (
         "## One flight, and what a vehicle sees\n\n![paths of one episode](trajectories.png)\n\n"

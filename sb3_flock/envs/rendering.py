@@ -1,65 +1,105 @@
-"""Drawing a flock with pygame: a window or a picture."""
+"""Drawing a flock with pygame: a picture, or a window."""
 
 from __future__ import annotations
 
+from collections import deque
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sb3_flock.sim import sense
+from sb3_flock.sim.sensing import is_connected, nearest
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from numpy.typing import NDArray
 
-    from sb3_flock.sim import Scenario, World
+    from sb3_flock.sim import Scenario, Sensing, World
 
 try:
     import pygame
 except ImportError as error:
     raise ImportError("rendering needs pygame: pip install 'sb3_flock[render]'") from error
 
-_SIZE = 640
-"""Side of the picture [pixels]."""
+SIDE = 640
+"""Side of the arena's picture [pixels]."""
+HEADER = 64
+"""Height of the two lines above it: the step's metrics and the legend [pixels]. Multiples of 16 suit video codecs."""
 _MARGIN = 1.1
 """The picture shows this many times the arena; the vehicles may leave it."""
+_FINE = 2
+"""Lines are drawn this many times larger and scaled down, which smooths them."""
+_TRAIL = 20
+"""Steps of a vehicle's trail."""
 
 # Okabe and Ito's palette, told apart by the color-blind as well; shapes differ, too.
 _BACKGROUND = (255, 255, 255)
 _GRID = (225, 225, 225)
+_TEXT = (60, 60, 60)
 _LINK = (86, 180, 233)
 _VEHICLE = (0, 114, 178)
 _VIOLATION = (213, 94, 0)
 _OBSTACLE = (204, 121, 167)
 _WAYPOINT = (0, 0, 0)
 
+Color = tuple[int, int, int]
+Pixels = tuple[float, float]
+
 
 class Renderer:
     """Draws the first flock of a world.
 
-    Vehicles are arrowheads inside a circle of half their minimum separation (circles that overlap are too close, and turn
-    orange); lines are links of the proximity graph; obstacles are discs inside a circle of their minimum separation; the
-    waypoint is a cross.
+    A vehicle is an arrowhead in a disc of half its minimum separation r_n' (discs that overlap are too close) in a ring of its
+    link range r_n, with its trail behind it; one that is too close to anything is orange. Lines are links of the proximity
+    graph, obstacles are squares in a ring of their minimum separation r_o', the waypoint is a cross with its path.
 
     :param scenario: the task
     :param render_mode: ``"human"`` opens a window at the first drawing, ``"rgb_array"`` never does
     :param fps: pictures per second in the window
     """
 
-    def __init__(self, scenario: Scenario, render_mode: str, fps: int) -> None:
-        self.scenario, self.render_mode, self.fps = scenario, render_mode, fps
-        self.canvas = pygame.Surface((_SIZE, _SIZE))
+    def __init__(self, scenario: Scenario, render_mode: str, fps: float) -> None:
+        self.render_mode, self.fps = render_mode, fps
         self._window: pygame.Surface | None = None
         self._clock = pygame.time.Clock()
-        half = _MARGIN * max(scenario.arena, scenario.obstacle_half_side)
-        self._scale = _SIZE / (2 * half)
+        self._arena = scenario.arena
+        self._scale = SIDE * _FINE / (2 * _MARGIN * max(scenario.arena, scenario.obstacle_half_side))
+        self._fine = pygame.Surface((SIDE * _FINE, SIDE * _FINE))
+        pygame.font.init()
+        self._font = pygame.font.Font(None, 19)
+        self._steps = -1
+        self._trails: deque[NDArray[np.float64]] = deque(maxlen=_TRAIL)
+        self._waypoints: list[NDArray[np.float64]] = []
 
     def draw(self, world: World) -> NDArray[np.uint8] | None:
         """The picture, ``(height, width, 3)``, or ``None`` after showing it in the window."""
-        self._paint(world)
         if self.render_mode == "human":
-            self._show()
+            self._show(self.paint(world))
             return None
-        return np.ascontiguousarray(pygame.surfarray.array3d(self.canvas).swapaxes(0, 1))
+        return self.picture(world)
+
+    def picture(self, world: World) -> NDArray[np.uint8]:
+        """The picture, ``(height, width, 3)``."""
+        return np.ascontiguousarray(pygame.surfarray.array3d(self.paint(world)).swapaxes(0, 1))
+
+    def paint(self, world: World) -> pygame.Surface:
+        """The picture as a surface of ``SIDE`` x ``HEADER + SIDE`` pixels."""
+        self._remember(world)
+        sensing = sense(world)
+        picture = pygame.Surface((SIDE, HEADER + SIDE))
+        picture.fill(_BACKGROUND)
+        self._paint_arena(world, sensing)
+        picture.blit(pygame.transform.smoothscale(self._fine, (SIDE, SIDE)), (0, HEADER))
+        self._paint_metrics(picture, world, sensing)
+        self._paint_legend(picture)
+        return picture
+
+    def position_at(self, pixels: Pixels) -> NDArray[np.float64]:
+        """The place in the world [m] under a pixel of the picture."""
+        x, y = pixels[0] * _FINE, (pixels[1] - HEADER) * _FINE
+        half = SIDE * _FINE / 2
+        return np.array([x - half, half - y]) / self._scale
 
     def close(self) -> None:
         """Close the window, if there is one."""
@@ -67,52 +107,144 @@ class Renderer:
             pygame.display.quit()
             self._window = None
 
-    def _show(self) -> None:
+    def _show(self, picture: pygame.Surface) -> None:
         if self._window is None:
             pygame.display.init()
-            self._window = pygame.display.set_mode((_SIZE, _SIZE))
+            self._window = pygame.display.set_mode(picture.get_size())
             pygame.display.set_caption("sb3_flock")
         pygame.event.pump()
-        self._window.blit(self.canvas, (0, 0))
+        self._window.blit(picture, (0, 0))
         pygame.display.flip()
         self._clock.tick(self.fps)
 
-    def _paint(self, world: World) -> None:
-        scenario, canvas = self.scenario, self.canvas
-        canvas.fill(_BACKGROUND)
-        corner = self._pixels(np.array([-scenario.arena, scenario.arena]))
-        side = 2 * scenario.arena * self._scale
-        pygame.draw.rect(canvas, _GRID, (*corner, side, side), width=2)
+    def _remember(self, world: World) -> None:
+        """Where vehicles and waypoint were, since the episode began; vehicles may have come or gone."""
+        if world.steps < self._steps or (self._trails and len(self._trails[-1]) != world.scenario.n_vehicles):
+            self._trails.clear()
+            self._waypoints = []
+        if world.steps != self._steps or not self._trails:
+            self._trails.append(world.positions[0].copy())
+            self._waypoints.append(world.waypoints[0].copy())
+        self._steps = world.steps
 
-        sensing = sense(world)
-        positions = world.positions[0]
-        too_close = sensing.neighbors.count(scenario.neighbor_separation)[0] > 0
-        hit = sensing.obstacles.count(scenario.obstacle_separation)[0] > 0
+    # -- the arena, in fine pixels -----------------------------------------------------------------------------------
+
+    def _paint_arena(self, world: World, sensing: Sensing) -> None:
+        scenario, canvas = world.scenario, self._fine
+        canvas.fill(_BACKGROUND)
+        side = 2 * self._arena * self._scale
+        pygame.draw.rect(canvas, _GRID, (*self._pixels((-self._arena, self._arena)), side, side), width=2 * _FINE)
+
+        positions, headings = world.positions[0], world.headings[0]
+        close = sensing.neighbors.count(scenario.neighbor_separation) + sensing.obstacles.count(scenario.obstacle_separation)
+        colors = [_VIOLATION if too_close else _VEHICLE for too_close in close[0]]
+        disc, ring = (self._scale * reach for reach in (scenario.neighbor_separation / 2, scenario.link_range))
+        for position in positions:
+            pygame.draw.circle(canvas, _GRID, self._pixels(position), ring, width=_FINE)
+        for position, color in zip(positions, colors, strict=True):
+            pygame.draw.circle(canvas, _paler(color, 0.8), self._pixels(position), disc)
+        self._path(self._waypoints, _paler(_WAYPOINT, 0.6), 2, dotted=True)
+        for vehicle in range(len(positions)):
+            self._path([trail[vehicle] for trail in self._trails], _paler(_VEHICLE, 0.5), 1)
         for i, j in zip(sensing.neighbors.observers, sensing.neighbors.bodies, strict=True):
             if i < j:  # each link is seen from both ends
-                pygame.draw.aaline(canvas, _LINK, self._pixels(positions[i]), self._pixels(positions[j]))
+                pygame.draw.line(canvas, _LINK, self._pixels(positions[i]), self._pixels(positions[j]), width=2 * _FINE)
         for obstacle in world.obstacle_positions[0]:
-            pygame.draw.circle(canvas, _OBSTACLE, self._pixels(obstacle), 5)
-            radius = scenario.obstacle_separation * self._scale
-            pygame.draw.circle(canvas, _OBSTACLE, self._pixels(obstacle), radius, width=1)
-        self._cross(world.waypoints[0])
-        for position, heading, violates in zip(positions, world.headings[0], too_close | hit, strict=True):
-            color = _VIOLATION if violates else _VEHICLE
-            self._arrowhead(position, heading, color)
-            radius = 0.5 * scenario.neighbor_separation * self._scale
-            pygame.draw.circle(canvas, color, self._pixels(position), radius, width=1)
+            pygame.draw.circle(
+                canvas, _OBSTACLE, self._pixels(obstacle), scenario.obstacle_separation * self._scale, width=2 * _FINE
+            )
+            _square(canvas, self._pixels(obstacle), 6 * _FINE)
+        _cross(canvas, self._pixels(world.waypoints[0]), 8 * _FINE)
+        for position, heading, color in zip(positions, headings, colors, strict=True):
+            _arrowhead(canvas, self._pixels(position), heading, max(7.0 * _FINE, 0.85 * disc), color)
 
-    def _arrowhead(self, position: NDArray[np.float64], heading: float, color: tuple[int, int, int]) -> None:
-        angles = heading + np.array([0.0, 2.5, np.pi, -2.5])
-        reach = np.array([1.0, 0.8, 0.3, 0.8])[:, None] * 11 / self._scale
-        corners = position + reach * np.stack((np.cos(angles), np.sin(angles)), axis=-1)
-        pygame.draw.polygon(self.canvas, color, [self._pixels(corner) for corner in corners])
+    def _path(self, points: Iterable[NDArray[np.float64]], color: Color, width: int, dotted: bool = False) -> None:
+        pixels = [self._pixels(point) for point in points]
+        if dotted:
+            for pixel in pixels[::2]:
+                pygame.draw.circle(self._fine, color, pixel, width)
+        elif len(pixels) > 1:
+            pygame.draw.lines(self._fine, color, False, pixels, width * _FINE)
 
-    def _cross(self, position: NDArray[np.float64]) -> None:
-        x, y = self._pixels(position)
-        pygame.draw.line(self.canvas, _WAYPOINT, (x - 7, y), (x + 7, y), width=3)
-        pygame.draw.line(self.canvas, _WAYPOINT, (x, y - 7), (x, y + 7), width=3)
+    def _pixels(self, point: Iterable[float]) -> Pixels:
+        """World meters, y up, to fine pixels, y down."""
+        x, y = point
+        half = SIDE * _FINE / 2
+        return half + float(x) * self._scale, half - float(y) * self._scale
 
-    def _pixels(self, point: NDArray[np.float64]) -> tuple[float, float]:
-        """World meters, y up, to pixels, y down."""
-        return _SIZE / 2 + float(point[0]) * self._scale, _SIZE / 2 - float(point[1]) * self._scale
+    # -- the header --------------------------------------------------------------------------------------------------
+
+    def _paint_metrics(self, picture: pygame.Surface, world: World, sensing: Sensing) -> None:
+        scenario, positions = world.scenario, world.positions
+        words = [
+            (f"{world.steps * scenario.time_step:.1f} s", False),
+            (f"tracking error {sensing.waypoint_distances.mean():#.3g} m", False),
+        ]
+        bodies = (
+            ("nearest neighbor", nearest(positions, positions, others=True), scenario.neighbor_separation),
+            ("obstacle", nearest(positions, world.obstacle_positions), scenario.obstacle_separation),
+        )
+        for name, distances, separation in bodies:
+            least = distances.min()
+            if np.isfinite(least):
+                words.append((f"{name} {least:#.3g} m", bool(least < separation)))
+        words.append(("connected" if is_connected(sensing.neighbors)[0] else "not connected", False))
+        x = 12
+        for word, is_bad in words:
+            text = self._font.render(word, True, _VIOLATION if is_bad else _TEXT)
+            picture.blit(text, (x, 10))
+            x += text.get_width() + 14
+
+    def _paint_legend(self, picture: pygame.Surface) -> None:
+        fine = pygame.Surface((SIDE * _FINE, HEADER * _FINE // 2))
+        fine.fill(_BACKGROUND)
+        y, words = fine.get_height() / 2, []
+        x = 20.0 * _FINE
+
+        def name(word: str, *, after: float) -> None:
+            nonlocal x
+            words.append((word, x / _FINE + after))
+            x += (after + self._font.size(word)[0] + 26) * _FINE
+
+        pygame.draw.circle(fine, _paler(_VEHICLE, 0.8), (x, y), 9 * _FINE)
+        _arrowhead(fine, (x, y), np.pi / 2, 8 * _FINE, _VEHICLE)
+        name("vehicle, r_n' / 2", after=14)
+        pygame.draw.circle(fine, _paler(_GRID, -0.25), (x, y), 9 * _FINE, width=_FINE)
+        name("r_n", after=14)
+        pygame.draw.line(fine, _LINK, (x - 9 * _FINE, y), (x + 9 * _FINE, y), width=2 * _FINE)
+        name("link", after=14)
+        _arrowhead(fine, (x, y), np.pi / 2, 8 * _FINE, _VIOLATION)
+        name("too close", after=12)
+        pygame.draw.circle(fine, _OBSTACLE, (x, y), 9 * _FINE, width=2 * _FINE)
+        _square(fine, (x, y), 5 * _FINE)
+        name("obstacle, r_o'", after=14)
+        _cross(fine, (x, y), 7 * _FINE)
+        name("waypoint", after=12)
+        picture.blit(pygame.transform.smoothscale(fine, (SIDE, HEADER // 2)), (0, HEADER // 2))
+        for word, left in words:
+            text = self._font.render(word, True, _TEXT)
+            picture.blit(text, (left, HEADER // 2 + (HEADER // 2 - text.get_height()) / 2 + 1))
+
+
+def _arrowhead(canvas: pygame.Surface, center: Pixels, heading: float, size: float, color: Color) -> None:
+    angles = heading + np.array([0.0, 2.5, np.pi, -2.5])
+    reach = np.array([1.0, 0.8, 0.3, 0.8]) * size
+    corners = np.stack((center[0] + reach * np.cos(angles), center[1] - reach * np.sin(angles)), axis=-1)
+    pygame.draw.polygon(canvas, color, corners.tolist())
+
+
+def _cross(canvas: pygame.Surface, center: Pixels, size: float) -> None:
+    x, y = center
+    pygame.draw.line(canvas, _WAYPOINT, (x - size, y), (x + size, y), width=3 * _FINE)
+    pygame.draw.line(canvas, _WAYPOINT, (x, y - size), (x, y + size), width=3 * _FINE)
+
+
+def _square(canvas: pygame.Surface, center: Pixels, half: float) -> None:
+    pygame.draw.rect(canvas, _OBSTACLE, (center[0] - half, center[1] - half, 2 * half, 2 * half))
+
+
+def _paler(color: Color, share: float) -> Color:
+    """A color mixed with so much white; with black for a negative share."""
+    target = 255 if share > 0 else 0
+    red, green, blue = (round(value + abs(share) * (target - value)) for value in color)
+    return red, green, blue

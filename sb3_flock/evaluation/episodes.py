@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any, Protocol
 
 import numpy as np
@@ -79,6 +80,34 @@ def fly(
     return {name: np.concatenate([result[name] for result in results]) for name in results[0]}
 
 
+def fly_one(policy: Any, scenario: Scenario, seed: int = 0, episode: int = 0) -> Iterator[World]:
+    """Fly one episode, the same that :func:`fly` flies under this number.
+
+    :param policy: as in :func:`evaluate`
+    :return: the world at the start and after each step, always the same object
+    """
+    check_integer("seed", seed, 0)
+    check_integer("episode", episode, 0)
+    controller, world, rngs = as_controller(policy, scenario), World(scenario), [episode_rng(seed, episode)]
+    sensing = world.reset(rngs)
+    if hasattr(controller, "reset"):
+        controller.reset(rngs, scenario)
+    yield world
+    for _ in range(scenario.max_cycles):
+        sensing, _ = world.step(controller.act(sensing, scenario))
+        yield world
+
+
+def as_controller(policy: Any, scenario: Scenario) -> Controller:
+    """Whatever can fly as a :class:`Controller`, checked against the scenario.
+
+    :raises PolicyError: if a loaded policy's tensor has another shape; it warns where the tensor means something else
+    """
+    if hasattr(policy, "check"):
+        policy.check(scenario)
+    return policy if hasattr(policy, "act") else PolicyController(policy)
+
+
 def evaluate(
     policy: Any, scenario: Scenario | None = None, episodes: int = 1000, seed: int = 0, batch: int = BATCH
 ) -> dict[str, Metric]:
@@ -95,7 +124,4 @@ def evaluate(
     scenario = scenario or getattr(policy, "scenario", None)
     if scenario is None:
         raise SettingsError("scenario = None: the policy carries none, so one is needed")
-    if hasattr(policy, "check"):
-        policy.check(scenario)
-    controller = policy if hasattr(policy, "act") else PolicyController(policy)
-    return summarize(fly(controller, scenario, episodes, seed, batch))
+    return summarize(fly(as_controller(policy, scenario), scenario, episodes, seed, batch))

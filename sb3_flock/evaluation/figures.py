@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_flock.evaluation.episodes import Controller
+from sb3_flock.evaluation.episodes import fly_one
 from sb3_flock.settings import SettingsError
 from sb3_flock.sim import Scenario, World, episode_rng, observe
 from sb3_flock.sim.sensing import sense
@@ -39,16 +39,10 @@ class Flight:
     """``(steps + 1, 2)`` [m]."""
 
 
-def record(controller: Controller, scenario: Scenario, seed: int = 0, episode: int = 0) -> Flight:
-    """Fly one episode, the same that :func:`~sb3_flock.evaluation.fly` flies under this number."""
-    world, rngs = World(scenario), [episode_rng(seed, episode)]
-    sensing = world.reset(rngs)
-    if hasattr(controller, "reset"):
-        controller.reset(rngs, scenario)
-    seen = [(world.positions[0], world.obstacle_positions[0], world.waypoints[0])]
-    for _ in range(scenario.max_cycles):
-        sensing, _ = world.step(controller.act(sensing, scenario))
-        seen.append((world.positions[0], world.obstacle_positions[0], world.waypoints[0]))
+def record(policy: Any, scenario: Scenario, seed: int = 0, episode: int = 0) -> Flight:
+    """Fly one episode and keep every position; the parameters are those of :func:`~sb3_flock.evaluation.episodes.fly_one`."""
+    worlds = fly_one(policy, scenario, seed, episode)
+    seen = [(world.positions[0], world.obstacle_positions[0], world.waypoints[0]) for world in worlds]
     return Flight(scenario, *(np.stack(parts) for parts in zip(*seen, strict=True)))
 
 
@@ -67,11 +61,17 @@ def new_figure(width: float = 5.0, height: float = 4.0, columns: int = 1) -> tup
 
 def save(figure: Figure, stem: str | Path) -> None:
     """Write ``<stem>.png`` and ``<stem>.svg``, the same bytes each time."""
-    figure.savefig(f"{stem}.png", dpi=150, metadata={"Software": None})
+    for kind in ("png", "svg"):
+        save_as(figure, Path(f"{stem}.{kind}"), kind)
+
+
+def save_as(figure: Figure, path: Path, kind: str) -> None:
+    """Write a ``"png"`` or an ``"svg"``, whatever the file's name."""
     import matplotlib as mpl
 
+    metadata: dict[str, Any] = {"Software": None} if kind == "png" else {"Date": None, "Creator": None}
     with mpl.rc_context({"svg.hashsalt": "sb3_flock"}):
-        figure.savefig(f"{stem}.svg", metadata={"Date": None, "Creator": None})
+        figure.savefig(path, format=kind, dpi=150, metadata=metadata)
 
 
 def trajectories(flight: Flight) -> Figure:
