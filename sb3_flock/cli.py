@@ -80,6 +80,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_train(commands)
     _add_evaluate(commands)
     _add_render(commands)
+    _add_play(commands)
     _add_reproduce(commands)
     _add_config(commands)
     return parser
@@ -325,7 +326,7 @@ def _add_render(commands: Any) -> None:
     _add_flight_flags(parser)
     parser.add_argument("--out", required=True, metavar="FILE", help="file to write; its name's end says the kind")
     parser.add_argument("--episode", type=_count(0), default=0, metavar="N", help="number of the seed's episode [0]")
-    parser.add_argument("--speed", type=float, default=2.0, metavar="X", help="times real time [2]")
+    _add_speed(parser)
     parser.set_defaults(run=_render)
 
 
@@ -345,6 +346,37 @@ def _render(options: argparse.Namespace, words: Sequence[str]) -> int:
         except OSError as error:
             raise SettingsError(f"--out {options.out}: {error.strerror or error}") from None
     print(path)
+    return 0
+
+
+# -- play ------------------------------------------------------------------------------------------------------------
+
+
+def _add_play(commands: Any) -> None:
+    parser = commands.add_parser(
+        "play",
+        help="fly live in a window, with mouse and keys",
+        description="Fly live in a window: drag the waypoint, drop obstacles, add vehicles, see what one of them sees.",
+        epilog="example: sb3-flock play general --n-vehicles 8",
+    )
+    _add_flight_flags(parser)
+    _add_speed(parser)
+    parser.set_defaults(run=_play)
+
+
+def _add_speed(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--speed", type=float, default=2.0, metavar="X", help="times real time [2]")
+
+
+def _play(options: argparse.Namespace, words: Sequence[str]) -> int:
+    import torch as th
+
+    from sb3_flock.play import play
+
+    th.set_num_threads(1)
+    flyer, _, scenario = _flight_of(options)
+    with _warnings_told():
+        play(flyer, scenario, options.seed, options.speed)
     return 0
 
 

@@ -30,8 +30,8 @@ _MARGIN = 1.1
 """The picture shows this many times the arena; the vehicles may leave it."""
 _FINE = 2
 """Lines are drawn this many times larger and scaled down, which smooths them."""
-_TRAIL = 20
-"""Steps of a vehicle's trail."""
+_TRAIL, _WAYPOINT_PATH = 20, 400
+"""Steps of a vehicle's trail and of the waypoint's path."""
 
 # Okabe and Ito's palette, told apart by the color-blind as well; shapes differ, too.
 _BACKGROUND = (255, 255, 255)
@@ -70,7 +70,7 @@ class Renderer:
         self._font = pygame.font.Font(None, 19)
         self._steps = -1
         self._trails: deque[NDArray[np.float64]] = deque(maxlen=_TRAIL)
-        self._waypoints: list[NDArray[np.float64]] = []
+        self._waypoints: deque[NDArray[np.float64]] = deque(maxlen=_WAYPOINT_PATH)
 
     def draw(self, world: World) -> NDArray[np.uint8] | None:
         """The picture, ``(height, width, 3)``, or ``None`` after showing it in the window."""
@@ -101,6 +101,11 @@ class Renderer:
         half = SIDE * _FINE / 2
         return np.array([x - half, half - y]) / self._scale
 
+    def pixels_of(self, position: NDArray[np.float64]) -> Pixels:
+        """The pixel of the picture over a place in the world [m]."""
+        x, y = self._pixels(position)
+        return x / _FINE, y / _FINE + HEADER
+
     def close(self) -> None:
         """Close the window, if there is one."""
         if self._window is not None:
@@ -121,7 +126,7 @@ class Renderer:
         """Where vehicles and waypoint were, since the episode began; vehicles may have come or gone."""
         if world.steps < self._steps or (self._trails and len(self._trails[-1]) != world.scenario.n_vehicles):
             self._trails.clear()
-            self._waypoints = []
+            self._waypoints.clear()
         if world.steps != self._steps or not self._trails:
             self._trails.append(world.positions[0].copy())
             self._waypoints.append(world.waypoints[0].copy())

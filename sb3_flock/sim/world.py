@@ -31,8 +31,8 @@ _EPISODE = (
     "obstacle_positions",
     "obstacle_headings",
     "waypoints",
-    "_obstacle_speeds",
-    "_obstacle_turns",
+    "obstacle_speeds",
+    "obstacle_turn_rates",
 )
 """The arrays of an episode under way."""
 
@@ -64,6 +64,10 @@ class World:
     """``(flocks, obstacles)`` [rad], in [-pi, pi)."""
     waypoints: NDArray[np.float64]
     """``(flocks, 2)`` [m]."""
+    obstacle_speeds: NDArray[np.float64]
+    """``(max_cycles, flocks, obstacles)`` [m/s], drawn at the reset."""
+    obstacle_turn_rates: NDArray[np.float64]
+    """``(max_cycles, flocks, obstacles)`` [rad/s], drawn at the reset."""
     steps: int
     """Steps taken since the reset, k."""
 
@@ -112,8 +116,8 @@ class World:
             np.stack(parts) for parts in zip(*starts, strict=True)
         )
         courses = [self._course(rng) for rng in rngs]
-        self._obstacle_speeds = np.stack([speeds for speeds, _ in courses], axis=1)
-        self._obstacle_turns = np.stack([turns for _, turns in courses], axis=1) * scenario.obstacle_turn_std
+        self.obstacle_speeds = np.stack([speeds for speeds, _ in courses], axis=1)
+        self.obstacle_turn_rates = np.stack([turns for _, turns in courses], axis=1) * scenario.obstacle_turn_std
         self.steps = 0
         return sense(self)
 
@@ -167,7 +171,7 @@ class World:
     def _move_obstacles(self, dt: float) -> None:
         """Unicycles with drawn speeds and turn rates, turned back at the edge of their square."""
         bound = self.scenario.obstacle_half_side
-        speeds, turn_rates = self._obstacle_speeds[self.steps], self._obstacle_turns[self.steps]
+        speeds, turn_rates = self.obstacle_speeds[self.steps], self.obstacle_turn_rates[self.steps]
         positions = _moved(self.obstacle_positions, _directions(self.obstacle_headings), speeds, dt)
         outside = np.maximum(np.abs(positions[..., 0]), np.abs(positions[..., 1])) > bound
         self.obstacle_positions = np.clip(positions, -bound, bound)

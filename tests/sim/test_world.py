@@ -44,8 +44,8 @@ def test_a_waypoint_on_the_origin_or_without_speed_stays(scenario, place):
 def test_an_obstacle_walks_as_a_unicycle_and_turns_back_at_the_edge(scenario, place):
     world = place(scenario, [(0.0, 0.0)], [0.0], obstacles=[(0.0, 0.5), (0.999, 0.0)])
     world.obstacle_headings = np.array([[np.pi / 2, 0.0]])
-    world._obstacle_speeds[0] = [[0.05, 0.1]]
-    world._obstacle_turns[0] = [[1.0, 0.5]]
+    world.obstacle_speeds[0] = [[0.05, 0.1]]
+    world.obstacle_turn_rates[0] = [[1.0, 0.5]]
     world.step(np.zeros((1, 1, 2)))
     np.testing.assert_allclose(world.obstacle_positions[0], [(0.0, 0.505), (1.0, 0.0)], atol=1e-12)
     np.testing.assert_allclose(world.obstacle_headings[0], [np.pi / 2 + 0.1, 0.05 - np.pi], atol=1e-12)
@@ -76,10 +76,10 @@ def test_the_walk_has_the_stated_distribution():
     scenario = Scenario(n_vehicles=1, n_obstacles=50)
     world = World(scenario, 20)
     world.reset([episode_rng(1, e) for e in range(20)])
-    assert world._obstacle_speeds.min() >= 0
-    assert world._obstacle_speeds.max() <= scenario.obstacle_max_speed
-    assert world._obstacle_speeds.mean() == pytest.approx(0.05, rel=0.01)
-    assert world._obstacle_turns.std() == pytest.approx(2.0, rel=0.01)
+    assert world.obstacle_speeds.min() >= 0
+    assert world.obstacle_speeds.max() <= scenario.obstacle_max_speed
+    assert world.obstacle_speeds.mean() == pytest.approx(0.05, rel=0.01)
+    assert world.obstacle_turn_rates.std() == pytest.approx(2.0, rel=0.01)
 
 
 @settings(max_examples=30, deadline=None)
