@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sb3_flock.evaluation.episodes import as_controller
 from sb3_flock.settings import SettingsError
-from sb3_flock.sim import Scenario, World, episode_rng, observe, sense
+from sb3_flock.sim import Scenario, Sensing, World, episode_rng, observe, sense
 
 try:
     import pygame
@@ -50,6 +50,11 @@ class Game:
     :param seed: of the episodes
     :raises SettingsError: if pygame is not installed
     """
+
+    world: World
+    sensing: Sensing
+    held: NDArray[np.float64] | None
+    """Where the waypoint was dragged to."""
 
     def __init__(self, policy: Any, scenario: Scenario, seed: int = 0) -> None:
         self.controller = as_controller(policy, scenario)
@@ -119,7 +124,7 @@ class Game:
 
     def _begin(self) -> None:
         self.rng = episode_rng(self.seed, self.episode)
-        self.held: NDArray[np.float64] | None = None
+        self.held = None
         self.world = World(self.scenario)
         self.sensing = self.world.reset([self.rng])
         self._tell_controller()
