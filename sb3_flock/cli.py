@@ -81,6 +81,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_evaluate(commands)
     _add_render(commands)
     _add_play(commands)
+    _add_export(commands)
     _add_reproduce(commands)
     _add_config(commands)
     return parser
@@ -219,8 +220,12 @@ def _add_flight_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scenario", dest="obstacle_motion", metavar="NAME", help="walk or crossing [as trained]")
     parser.add_argument("--seed", type=_count(0), default=0, metavar="N", help="seed of the episodes [0]")
     parser.add_argument("--device", default="cpu", metavar="NAME", help="torch device [cpu]")
-    parser.add_argument("--trust", action="store_true", help="let SB3 load the policy, which runs any code in the file")
+    _add_trust(parser)
     _add_set(parser, "obstacle_arena=0.5")
+
+
+def _add_trust(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--trust", action="store_true", help="let SB3 load the policy, which runs any code in the file")
 
 
 def _flight_of(options: argparse.Namespace) -> tuple[Any, str, Any]:
@@ -236,17 +241,21 @@ def _flight_of(options: argparse.Namespace) -> tuple[Any, str, Any]:
 
         flyer, name, trained_for = make_controller(options.controller), options.controller, Scenario()
     else:
-        from sb3_flock.rl.loading import load_policy
-
-        if options.trust:
-            print("sb3-flock: warning: --trust runs any code that is in the policy file", file=sys.stderr)
-        with _warnings_told():
-            flyer = load_policy(options.policy, options.device, options.trust)
+        flyer = _load_policy(options.policy, options.device, options.trust)
         name, trained_for = str(flyer.path), flyer.scenario
     overrides = parse_overrides(options.set)
     flags = ("n_vehicles", "n_obstacles", "obstacle_motion")
     overrides.update({key: value for key in flags if (value := getattr(options, key)) is not None})
     return flyer, name, load_config(Scenario, overrides=overrides, base=trained_for)
+
+
+def _load_policy(path: str, device: str, trust: bool) -> Any:
+    from sb3_flock.rl.loading import load_policy
+
+    if trust:
+        print("sb3-flock: warning: --trust runs any code that is in the policy file", file=sys.stderr)
+    with _warnings_told():
+        return load_policy(path, device, trust)
 
 
 def _count(least: int) -> Any:
@@ -377,6 +386,42 @@ def _play(options: argparse.Namespace, words: Sequence[str]) -> int:
     flyer, _, scenario = _flight_of(options)
     with _warnings_told():
         play(flyer, scenario, options.seed, options.speed)
+    return 0
+
+
+# -- export ----------------------------------------------------------------------------------------------------------
+
+
+def _add_export(commands: Any) -> None:
+    parser = commands.add_parser(
+        "export",
+        help="write a policy as ONNX, for a vehicle's computer",
+        description="Write a policy as an ONNX graph from measured positions to speed and turn rate, and check it.",
+        epilog="example: sb3-flock export paper-5v2o policy.onnx",
+    )
+    parser.add_argument("policy", metavar="POLICY", help=_POLICY_HELP)
+    parser.add_argument("out", metavar="FILE", help="file to write, such as policy.onnx")
+    _add_trust(parser)
+    parser.set_defaults(run=_export)
+
+
+def _export(options: argparse.Namespace, words: Sequence[str]) -> int:
+    import torch as th
+
+    from sb3_flock.rl.onboard import export
+
+    th.set_num_threads(1)
+    policy = _load_policy(options.policy, "cpu", options.trust)
+    try:
+        done = export(policy, options.out)
+    except OSError as error:
+        raise SettingsError(f"export {options.out}: {error.strerror or error}") from None
+    print(
+        f"differs from the policy by at most {done.difference:.1g} of the range in {done.situations} situations; "
+        f"{1000 * done.latency:.3f} ms a decision (median, one core)",
+        file=sys.stderr,
+    )
+    print(done.path)
     return 0
 
 

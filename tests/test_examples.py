@@ -1,5 +1,6 @@
 """Every example runs, shortened by its own argument."""
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -30,6 +31,17 @@ def test_evaluating_a_policy(tmp_path):
     words = ["train", "--total-timesteps", "60", "--eval-freq", "0", "--output-dir", str(tmp_path)]
     assert main([*words, "--set", "test_episodes=1", "--set", "buffer_size=100"]) == 0
     assert run("evaluate_policy.py", tmp_path / "ddpg_3v1o_1", cwd=tmp_path).count("vehicles:") == 4
+
+
+def test_flying_on_board_needs_numpy_and_onnxruntime_alone(tmp_path):
+    assert main(["export", "paper-5v2o", str(tmp_path / "policy.onnx")]) == 0
+    said = run("fly_onboard.py", tmp_path / "policy.onnx", cwd=tmp_path)
+    last = [float(number) for number in re.findall(r"([\d.]+) m ", said.splitlines()[-1])]
+    assert last[0] < 0.15
+    assert last[1] >= 0.1
+    assert last[2] >= 0.15
+    imported = set(re.findall(r"^import (\w+)", (EXAMPLES / "fly_onboard.py").read_text(), re.MULTILINE))
+    assert imported <= {"json", "sys", "numpy", "onnxruntime"}
 
 
 def test_no_example_is_left_out():

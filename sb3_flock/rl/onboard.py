@@ -1,0 +1,219 @@
+"""A policy for a vehicle's computer: one ONNX graph from what is measured to what is commanded, tensor included."""
+
+from __future__ import annotations
+
+import copy
+import json
+import logging
+import time
+import warnings
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.sac.policies import SACPolicy
+from stable_baselines3.td3.policies import TD3Policy
+from torch import nn
+
+from sb3_flock.rl.loading import LoadedPolicy
+from sb3_flock.rl.saving import versions, write_whole
+from sb3_flock.settings import RunError, SettingsError
+from sb3_flock.sim import Scenario, World, episode_rng, observe
+from sb3_flock.sim.sensing import find_contacts
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+INPUTS = ("neighbors", "obstacles", "waypoint")
+TOLERANCE = 1e-5
+"""Largest difference to ``predict`` that an exported policy may have, as a share of the action's range; it is float32's."""
+
+Situation = tuple["NDArray[np.float64]", "NDArray[np.float64]", "NDArray[np.float64]"]
+"""The three inputs of the graph."""
+
+
+@dataclass(frozen=True)
+class Export:
+    """What was written, and how it compares with the policy."""
+
+    path: Path
+    situations: int
+    difference: float
+    """Largest difference to ``predict`` in those situations, as a share of the action's range."""
+    latency: float
+    """Median time of a decision on one core [s]."""
+
+
+class Onboard(nn.Module):
+    """The vehicle's side of a policy: the tensor of section IV-A, the actor, and physical units.
+
+    ``forward(neighbors, obstacles, waypoint)`` takes the positions of other vehicles ``(any number, 2)``, of obstacles ``(any
+    number, 2)`` and of the waypoint ``(2,)``, all in the body frame [m] (forward is +x, left is +y) and float64, as NumPy has
+    it; what is out of its range is left out as in :func:`~sb3_flock.sim.sense`. It gives ``(2,)``: speed [m/s] and turn rate
+    [rad/s].
+
+    It counts in float64 throughout: where a policy turns about, float32 is off by 1e-5 rad/s, and the time goes elsewhere.
+
+    :param policy: a policy of DDPG, TD3 or SAC for the flock's tensor
+    :param scenario: the task, whose ranges it flies with
+    :raises SettingsError: for another kind of policy
+    """
+
+    low: th.Tensor
+    high: th.Tensor
+
+    def __init__(self, policy: Any, scenario: Scenario) -> None:
+        super().__init__()
+        self.scenario = scenario
+        actor: Any = getattr(policy, "actor", None)
+        if isinstance(policy, TD3Policy):
+            parts = [actor.features_extractor, actor.mu]
+        elif isinstance(policy, SACPolicy):
+            parts = [actor.features_extractor, actor.latent_pi, actor.mu, nn.Tanh()]
+        else:
+            raise SettingsError(f"export: a policy of DDPG, TD3 or SAC is needed, not {type(policy).__name__}")
+        self.actor = copy.deepcopy(nn.Sequential(*parts)).double()
+        self.register_buffer("low", th.tensor(policy.action_space.low, dtype=th.float64))
+        self.register_buffer("high", th.tensor(policy.action_space.high, dtype=th.float64))
+
+    def forward(self, neighbors: th.Tensor, obstacles: th.Tensor, waypoint: th.Tensor) -> th.Tensor:
+        """The deterministic action, ``(2,)``."""
+        scenario = self.scenario
+        on_circle = waypoint / (_norm(waypoint) / scenario.goal_radius).clamp(min=1.0)
+        near, wide, goal = scenario.channel_radii
+        tensor = th.stack(
+            [
+                self._channel(neighbors, scenario.link_range, near),
+                self._channel(obstacles, scenario.detection_range, wide),
+                self._channel(on_circle[None], 2 * goal, goal),
+            ]
+        )
+        action = self.actor(tensor[None])[0]
+        return self.low + (action + 1) / 2 * (self.high - self.low)
+
+    def _channel(self, positions: th.Tensor, reach: float, radius: float) -> th.Tensor:
+        anchors = th.linspace(-radius, radius, self.scenario.n_anchors, dtype=th.float64)
+        sigma = self.scenario.anchor_width * 2 * radius / (self.scenario.n_anchors - 1)
+        # One more body, out of reach: runtimes disagree about sums over none.
+        positions = th.cat([positions, th.full((1, 2), 10 * reach, dtype=th.float64)])
+        in_reach = _norm(positions) < reach
+        factors = th.exp(-0.5 * ((positions[:, :, None] - anchors) / sigma).square())
+        return (in_reach[:, None].double() * factors[:, 0]).T @ factors[:, 1]
+
+
+def _norm(vectors: th.Tensor) -> th.Tensor:
+    return vectors.square().sum(-1).sqrt()
+
+
+def export(policy: LoadedPolicy, path: str | Path, situations: int = 1000, seed: int = 0) -> Export:
+    """Write a policy as ONNX, if it decides there as it does here.
+
+    The graph is that of :class:`Onboard`, its inputs are :data:`INPUTS`, its output is ``action``. What else a vehicle needs to
+    know (ranges, sampling period, units) is in the file's metadata under ``sb3_flock``, as JSON.
+
+    :param path: the file, which is written whole or not at all
+    :param situations: number of random situations in which it is compared with ``predict``
+    :param seed: of the situations
+    :raises SettingsError: if a library is not installed or there is no such folder
+    :raises RunError: if it differs from ``predict`` by more than :data:`TOLERANCE`
+    :raises OSError: if it cannot be written
+    """
+    path = Path(path)
+    if not path.absolute().parent.is_dir():
+        raise SettingsError(f"export {path}: there is no folder {path.parent}")
+    try:
+        import onnx
+        import onnxruntime
+        import onnxscript  # noqa: F401 - torch's exporter needs it
+    except ImportError as error:
+        raise SettingsError(f"export needs {error.name}: pip install 'sb3_flock[onnx]'") from None
+    scenario = policy.scenario
+    module = Onboard(policy.policy, scenario).eval()
+    any_number = {0: th.export.Dim.DYNAMIC}
+    with _quiet_exporter(), th.no_grad():
+        program = th.onnx.export(
+            module,
+            tuple(th.zeros(*shape, dtype=th.float64) for shape in ((3, 2), (2, 2), (2,))),
+            input_names=INPUTS,
+            output_names=["action"],
+            dynamic_shapes=(any_number, any_number, None),
+            dynamo=True,
+            verbose=False,
+        )
+    assert program is not None
+    model = program.model_proto
+    model.doc_string = " ".join(str(Onboard.__doc__).split(":param", maxsplit=1)[0].replace("``", "").split())
+    onnx.helper.set_model_props(model, {"sb3_flock": json.dumps(_metadata(policy))})
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    session = onnxruntime.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
+    difference, latency = _compare(session, policy, situations, seed)
+    if not difference <= TOLERANCE:
+        raise RunError(
+            f"export {path}: the graph differs from the policy by {difference:.2g} of the range, more than {TOLERANCE:g}"
+        )
+    with write_whole(path) as aside:
+        aside.write_bytes(model.SerializeToString())
+    return Export(path, situations, difference, latency)
+
+
+def _metadata(policy: LoadedPolicy) -> dict[str, Any]:
+    scenario = policy.scenario
+    names = ("link_range", "detection_range", "neighbor_separation", "obstacle_separation", "time_step", "max_speed")
+    return {
+        **policy.describe(),
+        "policy": policy.path.name,
+        "inputs": "positions in the body frame [m], forward +x, left +y: neighbors (any, 2), obstacles (any, 2), waypoint (2,)",
+        "output": "action (2,): speed [m/s], turn rate [rad/s]",
+        **{name: getattr(scenario, name) for name in (*names, "max_turn_rate")},
+        "exported_with": versions(),
+    }
+
+
+def _compare(session: Any, policy: LoadedPolicy, count: int, seed: int) -> tuple[float, float]:
+    """Largest difference to ``predict`` and median time of a decision."""
+    space: Any = policy.policy.action_space
+    worst, times = 0.0, []
+    for situation, tensor in random_situations(policy.scenario, count, seed):
+        start = time.perf_counter()
+        (action,) = session.run(None, dict(zip(INPUTS, situation, strict=True)))
+        times.append(time.perf_counter() - start)
+        expected, _ = policy.predict(tensor, deterministic=True)
+        worst = max(worst, float((np.abs(action - expected) / (space.high - space.low)).max()))
+    return worst, float(np.median(times))
+
+
+def random_situations(scenario: Scenario, count: int, seed: int) -> Iterator[tuple[Situation, NDArray[np.float32]]]:
+    """What one vehicle measures at the start of episodes of all sizes, in range or not, and the tensor it sees there."""
+    for number in range(count):
+        rng = episode_rng(seed, number)
+        bodies = {"n_vehicles": int(rng.integers(1, 13)), "n_obstacles": int(rng.integers(0, 6)), "obstacle_motion": "walk"}
+        arena = max(scenario.link_range, scenario.detection_range) * rng.uniform(2, 5)
+        world = World(scenario.replace(**bodies, arena=arena, obstacle_arena=arena))
+        sensing = world.reset([rng])
+        neighbors, obstacles = (
+            found.positions[found.observers == 0]
+            for found in (
+                find_contacts(world.positions, world.frames, world.positions, np.inf, others=True),
+                find_contacts(world.positions, world.frames, world.obstacle_positions, np.inf),
+            )
+        )
+        yield (neighbors, obstacles, sensing.waypoint_positions[0, 0]), observe(sensing, world.scenario)[0, 0]
+
+
+@contextmanager
+def _quiet_exporter() -> Iterator[None]:
+    """The exporter of torch tells of its own workings, not of the policy."""
+    before = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logging.disable(before)
