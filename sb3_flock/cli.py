@@ -82,6 +82,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_render(commands)
     _add_play(commands)
     _add_export(commands)
+    _add_compare(commands)
     _add_reproduce(commands)
     _add_config(commands)
     return parser
@@ -422,6 +423,44 @@ def _export(options: argparse.Namespace, words: Sequence[str]) -> int:
         file=sys.stderr,
     )
     print(done.path)
+    return 0
+
+
+# -- compare ---------------------------------------------------------------------------------------------------------
+
+
+def _add_compare(commands: Any) -> None:
+    parser = commands.add_parser(
+        "compare",
+        help="show trainings side by side",
+        description="Print the best evaluations of trainings and what differs in their configs; plot their curves.",
+        epilog="example: sb3-flock compare runs/ddpg_5v2o_1 runs/ddpg_5v2o_2 --out curves.png",
+    )
+    parser.add_argument("runs", nargs="+", metavar="RUN", help="run folders")
+    parser.add_argument("--out", metavar="FILE", help="plot the evaluations to this .png or .svg, too")
+    parser.set_defaults(run=_compare)
+
+
+def _compare(options: argparse.Namespace, words: Sequence[str]) -> int:
+    from rich.console import Console
+
+    from sb3_flock.evaluation.compare import curves_figure, differences_table, load_runs, results_table
+    from sb3_flock.evaluation.figures import check_figure_file, save_as
+
+    if options.out is not None:
+        check_figure_file(Path(options.out))
+    runs = load_runs(options.runs)
+    console = Console()
+    console.print(results_table(runs))
+    differences = differences_table(runs)
+    if differences is not None:
+        console.print(differences)
+    if options.out is not None:
+        try:
+            save_as(curves_figure(runs), Path(options.out), Path(options.out).suffix[1:])
+        except OSError as error:
+            raise SettingsError(f"--out {options.out}: {error.strerror or error}") from None
+        print(options.out)
     return 0
 
 

@@ -20,8 +20,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_STYLES = ("-", "--", "-.", ":")
+LINE_STYLES = ("-", "--", "-.", ":")
 _MARKERS = "osD^vP*X"
+FIGURES = (".png", ".svg")
+"""Kinds of files a figure is written to."""
 _VEHICLE, _OBSTACLE, _WAYPOINT = "#1b7837", "#c51b7d", "black"
 """Green vehicles, pink obstacles, a black waypoint, as in the paper; dark, middle and black in greyscale."""
 
@@ -46,7 +48,7 @@ def record(policy: Any, scenario: Scenario, seed: int = 0, episode: int = 0) -> 
     return Flight(scenario, *(np.stack(parts) for parts in zip(*seen, strict=True)))
 
 
-def new_figure(width: float = 5.0, height: float = 4.0, columns: int = 1) -> tuple[Figure, Any]:
+def new_figure(width: float = 5.0, height: float = 4.0, columns: int = 1, rows: int = 1) -> tuple[Figure, Any]:
     """A figure and its axes; needs no display.
 
     :raises SettingsError: if matplotlib is not installed
@@ -56,7 +58,7 @@ def new_figure(width: float = 5.0, height: float = 4.0, columns: int = 1) -> tup
     except ImportError:
         raise SettingsError("figures need matplotlib: pip install 'sb3_flock[figures]'") from None
     figure = Figure(figsize=(width, height), layout="constrained")
-    return figure, figure.subplots(1, columns)
+    return figure, figure.subplots(rows, columns)
 
 
 def save(figure: Figure, stem: str | Path) -> None:
@@ -148,12 +150,12 @@ def lines(
     :param levels: horizontal lines by label
     """
     figure, axes = new_figure(6.0, 4.0)
-    for (label, (x, y)), style, marker in zip(series.items(), cycle(_STYLES), cycle(_MARKERS), strict=False):
+    for (label, (x, y)), style, marker in zip(series.items(), cycle(LINE_STYLES), cycle(_MARKERS), strict=False):
         rows = np.atleast_2d(y)
         (line,) = axes.plot(x, np.median(rows, axis=0), style, marker=marker, markersize=4, label=label)
         if len(rows) > 1:
             axes.fill_between(x, rows.min(0), rows.max(0), color=line.get_color(), alpha=0.2, linewidth=0)
-    for (label, level), style in zip((levels or {}).items(), cycle(_STYLES[::-1]), strict=False):
+    for (label, level), style in zip((levels or {}).items(), cycle(LINE_STYLES[::-1]), strict=False):
         axes.axhline(level, color="0.4", linestyle=style, linewidth=1, label=label)
     if log_x:
         axes.set_xscale("log")
@@ -172,3 +174,16 @@ def check_matplotlib() -> None:
     :raises SettingsError: if it is not installed
     """
     new_figure()
+
+
+def check_figure_file(path: Path, kinds: Sequence[str] = FIGURES) -> None:
+    """Tell what is wrong with a file's name before the work, not after it.
+
+    :raises SettingsError: for another kind of file, a folder that is not there or, for a figure, a missing matplotlib
+    """
+    if path.suffix not in kinds:
+        raise SettingsError(f"--out {path}: a name that ends in {', '.join(kinds)} is needed")
+    if not path.absolute().parent.is_dir():
+        raise SettingsError(f"--out {path}: there is no folder {path.parent}")
+    if path.suffix in FIGURES:
+        check_matplotlib()

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_flock.evaluation.episodes import fly_one
-from sb3_flock.evaluation.figures import record, save_as, trajectories
+from sb3_flock.evaluation.figures import FIGURES, check_figure_file, record, save_as, trajectories
 from sb3_flock.rl.saving import write_whole
 from sb3_flock.settings import SettingsError
 from sb3_flock.sim import Scenario
@@ -66,23 +66,17 @@ def check_film(path: Path, speed: float) -> None:
 
     :raises SettingsError: one line
     """
-    kinds = [*FILMS, *FIGURES]
-    if path.suffix not in kinds:
-        raise SettingsError(f"--out {path}: a name that ends in {', '.join(kinds)} is needed")
-    if not path.absolute().parent.is_dir():
-        raise SettingsError(f"--out {path}: there is no folder {path.parent}")
+    check_figure_file(path, (*FILMS, *FIGURES))
     if not 0.01 <= speed <= 1000:
         raise SettingsError(f"--speed {speed:g}: from 0.01 to 1000 times real time is needed")
+    if path.suffix in FIGURES:
+        return
     try:
-        if path.suffix in FIGURES:
-            import matplotlib  # noqa: F401
-        else:
-            import imageio_ffmpeg  # noqa: F401
-            import PIL  # noqa: F401
-            import pygame  # noqa: F401
+        import imageio_ffmpeg  # noqa: F401
+        import PIL  # noqa: F401
+        import pygame  # noqa: F401
     except ImportError as error:
-        extra = "figures" if path.suffix in FIGURES else "render"
-        raise SettingsError(f"--out {path}: {error.name} is needed: pip install 'sb3_flock[{extra}]'") from None
+        raise SettingsError(f"--out {path}: {error.name} is needed: pip install 'sb3_flock[render]'") from None
 
 
 def _pictures(policy: Any, scenario: Scenario, seed: int, episode: int, stride: int) -> Iterator[Picture]:
@@ -176,5 +170,3 @@ FILMS: dict[str, Callable[[Path, Iterator[Picture], float, str], None]] = {
     ".html": _write_page,
 }
 """What moves, by the end of the file's name."""
-FIGURES = (".png", ".svg")
-"""What stands still."""

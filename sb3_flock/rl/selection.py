@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,8 +10,10 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Figure
 
 from sb3_flock.evaluation.episodes import PolicyController, fly
+from sb3_flock.evaluation.figures import record, trajectories
 from sb3_flock.evaluation.metrics import score
 from sb3_flock.rl.config import TrainingConfig
 from sb3_flock.rl.progress import FlockProgress
@@ -65,6 +68,7 @@ class Evaluation(BaseCallback):
             self.logger.record(f"eval/{name}", mean)
             self._history.setdefault(name, []).append(mean)
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
+        self._show_flight()
         self._last = self.num_timesteps
         self._history["timesteps"].append(self.num_timesteps)
         self._history["seconds"].append(time.monotonic() - self._started)
@@ -84,3 +88,10 @@ class Evaluation(BaseCallback):
             f"obstacle {100 * means['obstacle_violation_rate']:.2f} %, connected {100 * means['connectivity']:.1f} %, "
             f"score {current:.3f}{' (best)' if is_best else ''}"
         )
+
+    def _show_flight(self) -> None:
+        """The paths of the first of these episodes, as a picture for TensorBoard where matplotlib is installed."""
+        if importlib.util.find_spec("matplotlib") is not None:
+            flight = record(PolicyController(self.model), self.config.scenario, SELECTION_SEED)
+            picture = Figure(trajectories(flight), close=False)
+            self.logger.record("eval/flight", picture, exclude=("stdout", "log", "json", "csv"))

@@ -131,6 +131,9 @@ def test_logs_have_the_four_groups(tmp_path):
         "rollout/ep_rew_mean", "rollout/ep_mixed_rew_mean", "train/critic_loss", "train/noise", "eval/tracking_error",
         "eval/score", "flock/tracking_error", "flock/neighbor_violation", "flock/waypoint",
     } <= tags  # fmt: skip
+    flights = events.Images("eval/flight")
+    assert [flight.step for flight in flights] == [event.step for event in events.Scalars("eval/score")]
+    assert flights[0].encoded_image_string != flights[-1].encoded_image_string
 
 
 def test_a_zip_tells_its_task_and_versions_and_a_policy_flies_any_number(tmp_path):
