@@ -91,7 +91,7 @@ class Game:
         """Fly one step."""
         if self.world.steps == self.world.scenario.max_cycles:
             self._change(steps=0)
-        self.sensing, _ = self.world.step(self.controller.act(self.sensing, self.world.scenario))
+        self.sensing, _ = self.world.step(self.controller.act(self.world.sensors.measure(self.sensing), self.world.scenario))
         self._hold_waypoint()
 
     def handle(self, event: pygame.event.Event) -> None:

@@ -19,6 +19,7 @@ _Settings = TypeVar("_Settings", bound="Settings")
 Positive = Annotated[float, Field(ge=1e-6, le=1e6)]
 """Lengths, speeds, weights: so far from the ends of the floating point numbers that no formula here overflows."""
 NotNegative = Annotated[float, Field(ge=0, le=1e6)]
+Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
 
 
 class UserError(ValueError):

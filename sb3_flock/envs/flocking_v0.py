@@ -185,7 +185,7 @@ class parallel_env(ParallelEnv[str, Observation, Action]):  # noqa: N801 - Petti
             self._renderer = None
 
     def _observations(self, sensing: Sensing) -> dict[str, Observation]:
-        return dict(zip(self.possible_agents, observe(sensing, self.scenario)[0], strict=True))
+        return dict(zip(self.possible_agents, observe(self.world.sensors.measure(sensing), self.scenario)[0], strict=True))
 
     def _infos(self, sensing: Sensing, terms: dict[str, NDArray[np.float64]], truncated: bool) -> dict[str, dict[str, Any]]:
         scenario = self.scenario

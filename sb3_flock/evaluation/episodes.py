@@ -74,7 +74,7 @@ def fly(
         if hasattr(controller, "reset"):
             controller.reset(rngs, scenario)
         for _ in range(scenario.max_cycles):
-            sensing, clipped = world.step(controller.act(sensing, scenario))
+            sensing, clipped = world.step(controller.act(world.sensors.measure(sensing), scenario))
             metrics.update(world, sensing, own_reward(reward_terms(sensing, clipped, scenario)))
         results.append(metrics.result())
     return {name: np.concatenate([result[name] for result in results]) for name in results[0]}
@@ -94,7 +94,7 @@ def fly_one(policy: Any, scenario: Scenario, seed: int = 0, episode: int = 0) ->
         controller.reset(rngs, scenario)
     yield world
     for _ in range(scenario.max_cycles):
-        sensing, _ = world.step(controller.act(sensing, scenario))
+        sensing, _ = world.step(controller.act(world.sensors.measure(sensing), scenario))
         yield world
 
 

@@ -78,7 +78,8 @@ class PracticeConfig(Settings):
         1, ge=0, le=MAX_BODIES, description="obstacles added, where the task has any (ours; paper: 0)"
     )
     obstacle_arena_ratio: Positive = Field(
-        0.5, description="side of the obstacles' square, relative to the task's (ours; paper: 1)"
+        0.5,
+        description="side of the obstacles' square, relative to the task's, if none has a given start (ours; paper: 1)",
     )
     time_step_ratio: Positive = Field(
         2.0, description="sampling period while training, relative to the task's (ours; paper: 1)"
@@ -138,7 +139,8 @@ class TrainingConfig(Settings):
             max_cycles=max(1, round(scenario.max_cycles / practice.time_step_ratio)),
             n_vehicles=practice.vehicles or scenario.n_vehicles,
             n_obstacles=scenario.n_obstacles + (practice.extra_obstacles if scenario.n_obstacles else 0),
-            obstacle_arena=scenario.obstacle_half_side * practice.obstacle_arena_ratio,
+            obstacle_arena=scenario.obstacle_half_side
+            * (1.0 if scenario.obstacle_starts else practice.obstacle_arena_ratio),
             neighbor_separation=min(scenario.neighbor_separation * practice.separation_ratio, scenario.link_range),
             obstacle_separation=min(scenario.obstacle_separation * practice.separation_ratio, scenario.detection_range),
         )

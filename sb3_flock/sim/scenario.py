@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from sb3_flock.settings import NotNegative, Positive, Settings
+from sb3_flock.settings import Coordinate, NotNegative, Positive, Settings
 from sb3_flock.sim.reward import RewardWeights
+from sb3_flock.sim.sensors import SensorErrors
 
 MAX_BODIES = 1_000_000
 """Vehicles or obstacles at most. Each adds at most 1 to an anchor, so this bounds the tensor, whatever their number."""
+
+
+Points = Annotated[tuple[tuple[Coordinate, Coordinate], ...], Field(min_length=1, max_length=10_000)]
+"""Places ``[[x, y], ...]`` [m]."""
 
 
 class Scenario(Settings):
@@ -36,6 +41,11 @@ class Scenario(Settings):
     )
     waypoint_speed: NotNegative = Field(0.1, description="speed of the waypoint towards the origin [m/s] (paper, V)")
 
+    waypoint_route: Points | None = Field(
+        None,
+        description="points [x, y] the waypoint visits one after the other [m]; null: from anywhere to the origin (paper, V)",
+    )
+
     obstacle_motion: Literal["walk", "crossing"] = Field(
         "walk",
         description="walk: at random (paper, V); crossing: straight through the flock from its far side (ours)",
@@ -44,6 +54,10 @@ class Scenario(Settings):
     arena: Positive = Field(1.0, description="half side of the square in which all bodies start [m] (paper, V)")
     obstacle_arena: Positive | None = Field(
         None, description="half side of the square in which obstacles start and walk [m]; null: arena (paper, V)"
+    )
+    obstacle_starts: Points | None = Field(
+        None,
+        description="points [x, y] where obstacles start [m], to stay if their top speed is 0; null: drawn (paper, V)",
     )
     link_range: Positive = Field(0.15, description="proximity network threshold r_n [m] (paper, V)")
     neighbor_separation: NotNegative = Field(0.1, description="minimum separation to neighbors r_n' [m] (paper, V)")
@@ -64,6 +78,7 @@ class Scenario(Settings):
         1.0, ge=0.1, le=1e6, description="standard deviation sigma of the anchors' Gaussian [anchor spacings] (open)"
     )
 
+    sensors: SensorErrors = Field(default_factory=SensorErrors, description="errors of what vehicles measure (paper: none)")
     reward: RewardWeights = Field(default_factory=RewardWeights, description="weights of the reward (paper, IV-B)")
 
     @model_validator(mode="after")
@@ -71,6 +86,14 @@ class Scenario(Settings):
         for near, far in (("neighbor_separation", "link_range"), ("obstacle_separation", "detection_range")):
             if getattr(self, near) > getattr(self, far):
                 raise ValueError(f"{near} = {getattr(self, near)}: input should be at most {far} = {getattr(self, far)}")
+        if len(self.obstacle_starts or ()) > self.n_obstacles:
+            raise ValueError(
+                f"obstacle_starts has {len(self.obstacle_starts or ())} points: n_obstacles = {self.n_obstacles}"
+            )
+        for point in self.obstacle_starts or ():
+            if max(map(abs, point)) > self.obstacle_half_side:
+                square = f"the obstacles' square of half side {self.obstacle_half_side}"
+                raise ValueError(f"obstacle_starts: {point} is outside {square}")
         return self
 
     @property

@@ -11,6 +11,7 @@ import numpy as np
 
 from sb3_flock.settings import UserError
 from sb3_flock.sim.sensing import Sensing, sense
+from sb3_flock.sim.sensors import Sensors
 
 if TYPE_CHECKING:
     from numpy.random import Generator
@@ -74,6 +75,7 @@ class World:
     def __init__(self, scenario: Scenario, n_flocks: int = 1) -> None:
         self.scenario = scenario
         self.n_flocks = n_flocks
+        self.sensors = Sensors(scenario.sensors, scenario.time_step)
         self.action_low = np.array([0.0, -scenario.max_turn_rate])
         self.action_high = np.array([scenario.max_speed, scenario.max_turn_rate])
         # As large as the actions: NumPy is slow where it repeats a bound along a last axis this short.
@@ -102,7 +104,8 @@ class World:
         """Start an episode in every flock (section V).
 
         Vehicles and obstacles are uniform in their squares with uniform headings, the waypoint is uniform in the arena. A
-        body that starts closer to a vehicle than its minimum separation is drawn again.
+        body that starts closer to a vehicle than its minimum separation is drawn again. A route and given starts (ours) stand
+        in for what is drawn otherwise.
 
         :param rngs: one generator a flock
         :return: what the vehicles sense at the start
@@ -118,6 +121,7 @@ class World:
         courses = [self._course(rng) for rng in rngs]
         self.obstacle_speeds = np.stack([speeds for speeds, _ in courses], axis=1)
         self.obstacle_turn_rates = np.stack([turns for _, turns in courses], axis=1) * scenario.obstacle_turn_std
+        self.sensors.reset(rngs)
         self.steps = 0
         return sense(self)
 
@@ -136,15 +140,17 @@ class World:
         self.positions = _moved(self.positions, self.frames, clipped[..., 0], dt)
         self.headings = wrap_angle(self.headings + clipped[..., 1] * dt)
         self._move_obstacles(dt)
-        distance = np.sqrt(np.square(self.waypoints).sum(-1, keepdims=True))
-        stride = scenario.waypoint_speed * dt
-        self.waypoints = self.waypoints * (1.0 - np.minimum(stride / np.maximum(distance, stride or 1.0), 1.0))
         self.steps += 1
+        self._move_waypoints(scenario.waypoint_speed * dt)
         return sense(self), clipped
 
     def state_dict(self) -> dict[str, Any]:
         """The episode under way: all that its next steps depend on besides the actions."""
-        return {**{name: getattr(self, name) for name in _EPISODE}, "steps": self.steps}
+        return {
+            **{name: getattr(self, name) for name in _EPISODE},
+            "steps": self.steps,
+            "sensors": self.sensors.state_dict(),
+        }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on with the episode of :meth:`state_dict`.
@@ -167,6 +173,16 @@ class World:
                 raise ValueError(f"{name} has the shape {state[name].shape}: {shape} is needed")
             setattr(self, name, np.array(state[name], dtype=np.float64))
         self.steps = int(state["steps"])
+        self.sensors.load_state_dict(state["sensors"])
+
+    def _move_waypoints(self, stride: float) -> None:
+        """Straight towards the origin (section V), or along the route."""
+        route = self.scenario.waypoint_route
+        if route is not None:
+            self.waypoints = np.broadcast_to(along(np.array(route), stride * self.steps), self.waypoints.shape).copy()
+            return
+        distance = np.sqrt(np.square(self.waypoints).sum(-1, keepdims=True))
+        self.waypoints = self.waypoints * (1.0 - np.minimum(stride / np.maximum(distance, stride or 1.0), 1.0))
 
     def _move_obstacles(self, dt: float) -> None:
         """Unicycles with drawn speeds and turn rates, turned back at the edge of their square."""
@@ -179,23 +195,28 @@ class World:
 
     def _start(self, rng: Generator) -> tuple[NDArray[np.float64], ...]:
         scenario = self.scenario
-        placed = _Placed(scenario.neighbor_separation)
+        given = scenario.obstacle_starts or ()
+        placed, obstructed = _Placed(scenario.neighbor_separation), _Placed(scenario.obstacle_separation, given)
         positions = np.empty((scenario.n_vehicles, 2))
         for i in range(scenario.n_vehicles):
-            positions[i] = placed.draw_apart(rng, scenario.arena, "n_vehicles", scenario.n_vehicles)
+            positions[i] = placed.draw_apart(rng, scenario.arena, "n_vehicles", scenario.n_vehicles, obstructed)
             placed.add(*positions[i].tolist())
         placed = _Placed(scenario.obstacle_separation, positions.tolist())
         if scenario.obstacle_motion == "crossing":
             headings = rng.uniform(-np.pi, np.pi, scenario.n_vehicles)
-            waypoint = rng.uniform(-scenario.arena, scenario.arena, 2)
+            waypoint = self._first_waypoint(rng)
             return positions, headings, *self._far_side(rng, placed, waypoint), waypoint
         obstacles = np.empty((scenario.n_obstacles, 2))
-        for o in range(scenario.n_obstacles):
+        obstacles[: len(given)] = given or np.empty((0, 2))
+        for o in range(len(given), scenario.n_obstacles):
             obstacles[o] = placed.draw_apart(rng, scenario.obstacle_half_side, "n_obstacles", scenario.n_obstacles)
         headings = rng.uniform(-np.pi, np.pi, scenario.n_vehicles)
         obstacle_headings = rng.uniform(-np.pi, np.pi, scenario.n_obstacles)
-        waypoint = rng.uniform(-scenario.arena, scenario.arena, 2)
-        return positions, headings, obstacles, obstacle_headings, waypoint
+        return positions, headings, obstacles, obstacle_headings, self._first_waypoint(rng)
+
+    def _first_waypoint(self, rng: Generator) -> NDArray[np.float64]:
+        drawn = rng.uniform(-self.scenario.arena, self.scenario.arena, 2)
+        return drawn if self.scenario.waypoint_route is None else np.array(self.scenario.waypoint_route[0])
 
     def _far_side(
         self, rng: Generator, placed: _Placed, waypoint: NDArray[np.float64]
@@ -208,8 +229,10 @@ class World:
             angle = behind + rng.uniform(-np.pi / 4, np.pi / 4)
             return radius * np.array([math.cos(angle), math.sin(angle)])
 
+        given = scenario.obstacle_starts or ()
         starts = np.empty((count, 2))
-        for o in range(count):
+        starts[: len(given)] = given or np.empty((0, 2))
+        for o in range(len(given), count):
             starts[o] = placed.draw(point, f"a quarter of a circle of radius {radius} m", "n_obstacles", count)
         aims = rng.uniform(-scenario.link_range, scenario.link_range, (count, 2)) - starts
         return starts, np.arctan2(aims[:, 1], aims[:, 0])
@@ -235,6 +258,12 @@ def _directions(headings: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack((np.cos(headings), np.sin(headings)), axis=-1)
 
 
+def along(route: NDArray[np.float64], distance: float) -> NDArray[np.float64]:
+    """The point so far along a route ``(points, 2)`` [m], ``(2,)``; at its end beyond."""
+    lengths = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(route, axis=0).T))))
+    return np.array([np.interp(distance, lengths, coordinate) for coordinate in route.T])
+
+
 def wrap_angle(angles: NDArray[np.float64]) -> NDArray[np.float64]:
     """Angles in [-pi, pi) [rad]."""
     return angles - 2 * np.pi * np.floor((angles + np.pi) / (2 * np.pi))
@@ -254,18 +283,28 @@ class _Placed:
             return
         self._cells.setdefault(self._cell(x, y), []).append((x, y))
 
-    def draw_apart(self, rng: Generator, half_side: float, name: str, count: int) -> NDArray[np.float64]:
-        """A point uniform in the square, drawn again while it is closer than the separation to a vehicle."""
-        return self.draw(lambda: rng.uniform(-half_side, half_side, 2), f"a square of half side {half_side} m", name, count)
+    def draw_apart(
+        self, rng: Generator, half_side: float, name: str, count: int, others: _Placed | None = None
+    ) -> NDArray[np.float64]:
+        """A point uniform in the square, drawn again while it is closer than the separation to one of these or of others."""
+        where = f"a square of half side {half_side} m"
+        return self.draw(lambda: rng.uniform(-half_side, half_side, 2), where, name, count, others)
 
-    def draw(self, point_of: Callable[[], NDArray[np.float64]], where: str, name: str, count: int) -> NDArray[np.float64]:
-        """A point that a function draws, drawn again while it is closer than the separation to a vehicle."""
+    def draw(
+        self,
+        point_of: Callable[[], NDArray[np.float64]],
+        where: str,
+        name: str,
+        count: int,
+        others: _Placed | None = None,
+    ) -> NDArray[np.float64]:
+        """A point that a function draws, drawn again while it is closer than the separation to one of these or of others."""
         for _ in range(_MAX_REDRAWS):
             point = point_of()
-            if self._is_free(*point.tolist()):
+            if self._is_free(*point.tolist()) and (others is None or others._is_free(*point.tolist())):
                 return point
         raise WorldError(
-            f"{name} = {count}: no start at least {self.separation} m from the vehicles found in {_MAX_REDRAWS} draws "
+            f"{name} = {count}: no start at least {self.separation} m from the others found in {_MAX_REDRAWS} draws "
             f"from {where}; fewer bodies or a larger arena are needed"
         )
 

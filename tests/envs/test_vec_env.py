@@ -192,7 +192,7 @@ def test_with_workers_the_render_mode_is_known_and_the_rest_refused_clearly():
     env.reset()
     assert env.render_mode == "rgb_array"
     assert env.get_attr("render_mode") == ["rgb_array"] * 6
-    assert env.render().shape == (640, 640, 3)
+    assert env.render().shape == (704, 640, 3)
     with pytest.raises(NotImplementedError, match="num_cpus=0"):
         env.get_attr("scenario")
     env.close()

@@ -9,6 +9,7 @@ import pytest
 
 from sb3_flock.envs.flocking_v0 import observation_space
 from sb3_flock.sim import RewardWeights, Scenario, World, episode_rng, mix_rewards, observe, own_reward, reward_terms
+from sb3_flock.sim.sensors import SensorErrors
 from sb3_flock.sim.world import WorldError
 
 
@@ -27,6 +28,10 @@ def random_scenario(rng):
         obstacle_turn_std=rng.uniform(0, 20),
         obstacle_motion=str(rng.choice(["walk", "crossing"])),
         waypoint_speed=unit * rng.uniform(0, 1),
+        waypoint_route=None if rng.random() < 0.7 else (unit * rng.normal(size=(int(rng.integers(1, 5)), 2))).tolist(),
+        sensors=SensorErrors()
+        if rng.random() < 0.7
+        else SensorErrors(position_noise=unit * rng.random(), dropout=rng.random()),
         arena=unit * rng.uniform(0.5, 5),
         link_range=link,
         neighbor_separation=link * rng.uniform(0, 0.9),
@@ -62,12 +67,12 @@ def soak(vehicle_steps, seed):
             assert (moved <= reach + 1e-12 * (reach + np.abs(world.positions).max())).all()
             assert (np.abs(world.headings) <= np.pi).all()
             assert (np.abs(world.obstacle_positions) <= scenario.obstacle_half_side * (1 + 1e-12)).all() or m == 0
-            tensors = observe(sensing, scenario)
+            tensors = observe(world.sensors.measure(sensing), scenario)
             assert tensors.dtype == np.float32
             assert tensors.min() >= space.low.min()  # a NaN fails here, too
             assert tensors.max() <= n + m + 1
             terms = reward_terms(sensing, clipped, scenario)
-            farthest = np.sqrt(8) * (np.abs(world.positions).max() + scenario.arena)
+            farthest = np.sqrt(8) * (np.abs(world.positions).max() + scenario.arena + np.abs(world.waypoints).max())
             effort = scenario.max_speed**2 + scenario.max_turn_rate**2
             bounds = {
                 "connectivity": (-weights.separation_penalty * (n - 1), weights.link_bonus * (n - 1)),

@@ -3,6 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sb3_flock.settings import SettingsError
 from sb3_flock.sim import Scenario, World, episode_rng
 from sb3_flock.sim.sensing import nearest
 from sb3_flock.sim.world import WorldError
@@ -149,3 +150,49 @@ def test_stepping_without_a_reset_or_past_the_end_is_an_error():
 def test_every_flock_needs_its_generator():
     with pytest.raises(ValueError, match="rngs has 1 generators"):
         World(Scenario(), 2).reset([episode_rng(0, 0)])
+
+
+def test_a_route_is_followed_at_the_waypoints_speed_to_its_end():
+    scenario = Scenario(waypoint_route=[(0.0, 0.0), (0.1, 0.0), (0.1, 0.2)], waypoint_speed=0.5, n_vehicles=1)
+    world = World(scenario, 2)
+    world.reset([episode_rng(0, 0), episode_rng(0, 1)])
+    seen = [world.waypoints.copy()]
+    for _ in range(8):
+        world.step(np.zeros((2, 1, 2)))
+        seen.append(world.waypoints.copy())
+    places = [(0, 0), (0.05, 0), (0.1, 0), (0.1, 0.05), (0.1, 0.1), (0.1, 0.15), (0.1, 0.2), (0.1, 0.2), (0.1, 0.2)]
+    np.testing.assert_allclose(np.stack(seen), np.array(places)[:, None].repeat(2, axis=1), atol=1e-12)
+
+
+def test_a_route_of_one_point_is_a_place():
+    world = World(Scenario(waypoint_route=[(0.3, -0.2)]))
+    world.reset([episode_rng(0, 0)])
+    world.step(np.zeros((1, 3, 2)))
+    np.testing.assert_allclose(world.waypoints, [[0.3, -0.2]])
+
+
+@pytest.mark.parametrize("motion", ["walk", "crossing"])
+def test_given_obstacles_start_where_they_are_told_and_vehicles_keep_away(motion):
+    starts = [(0.0, 0.0), (0.5, 0.5)]
+    scenario = Scenario(
+        n_vehicles=8, n_obstacles=3, arena=0.4, obstacle_arena=0.6, obstacle_starts=starts, obstacle_motion=motion
+    )
+    for episode in range(20):
+        world = World(scenario.replace(obstacle_max_speed=0.0))
+        world.reset([episode_rng(0, episode)])
+        np.testing.assert_array_equal(world.obstacle_positions[0, :2], starts)
+        distances = np.linalg.norm(world.positions[0, :, None] - world.obstacle_positions[0], axis=-1)
+        assert distances.min() >= scenario.obstacle_separation
+        world.step(np.zeros((1, 8, 2)))
+        np.testing.assert_array_equal(world.obstacle_positions[0, :2], starts)  # with no speed they stay
+
+
+def test_given_obstacles_must_be_so_many_and_inside():
+    with pytest.raises(SettingsError, match=r"obstacle_starts has 2 points: n_obstacles = 1"):
+        Scenario(obstacle_starts=[(0, 0), (1, 1)])
+    with pytest.raises(
+        SettingsError, match=r"obstacle_starts: \(2\.0, 0\.0\) is outside the obstacles' square of half side 1\.0"
+    ):
+        Scenario(obstacle_starts=[(2, 0)])
+    with pytest.raises(SettingsError, match="waypoint_route = "):
+        Scenario(waypoint_route=[])

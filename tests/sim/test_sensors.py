@@ -1,0 +1,111 @@
+import numpy as np
+import pytest
+
+from sb3_flock import flocking_v0
+from sb3_flock.evaluation import evaluate
+from sb3_flock.evaluation.controllers import make_controller
+from sb3_flock.evaluation.episodes import fly
+from sb3_flock.settings import SettingsError
+from sb3_flock.sim import Scenario, World, episode_rng, sense
+from sb3_flock.sim.sensors import SensorErrors
+
+CROWD = Scenario(n_vehicles=12, n_obstacles=6, arena=0.35, obstacle_arena=0.6)
+
+
+def begin(scenario, n_flocks=1, first=0):
+    world = World(scenario, n_flocks)
+    return world, world.reset([episode_rng(0, episode) for episode in range(first, first + n_flocks)])
+
+
+def erring(**errors):
+    return CROWD.replace(sensors=SensorErrors(**errors))
+
+
+def test_exact_sensors_measure_the_truth_and_draw_nothing():
+    world, truth = begin(CROWD)
+    assert world.sensors.measure(truth) is truth
+    other, _ = begin(erring(position_noise=0.01))
+    np.testing.assert_array_equal(world.positions, other.positions)  # errors change no start
+    np.testing.assert_array_equal(world.obstacle_speeds, other.obstacle_speeds)
+
+
+def test_noise_is_as_large_as_asked_on_everything_measured():
+    world, truth = begin(erring(position_noise=0.02), n_flocks=200)
+    measured = world.sensors.measure(truth)
+    for contacts, exact in ((measured.neighbors, truth.neighbors), (measured.obstacles, truth.obstacles)):
+        np.testing.assert_array_equal(contacts.bodies, exact.bodies)
+        error = contacts.positions - exact.positions
+        assert error.std() == pytest.approx(0.02, rel=0.05)
+        assert abs(error.mean()) < 0.002
+        np.testing.assert_allclose(contacts.distances, np.linalg.norm(contacts.positions, axis=-1))
+    error = measured.waypoint_positions - truth.waypoint_positions
+    assert error.std() == pytest.approx(0.02, rel=0.05)
+    np.testing.assert_allclose(measured.waypoint_distances, np.linalg.norm(measured.waypoint_positions, axis=-1))
+
+
+def test_as_many_detections_are_missed_as_asked_but_never_the_waypoint():
+    world, truth = begin(erring(dropout=0.3), n_flocks=200)
+    measured = world.sensors.measure(truth)
+    for contacts, exact in ((measured.neighbors, truth.neighbors), (measured.obstacles, truth.obstacles)):
+        assert len(contacts.bodies) / len(exact.bodies) == pytest.approx(0.7, abs=0.03)
+        pairs = set(zip(exact.observers.tolist(), exact.bodies.tolist(), strict=True))
+        assert set(zip(contacts.observers.tolist(), contacts.bodies.tolist(), strict=True)) < pairs
+        assert (np.diff(contacts.observers) >= 0).all()
+    np.testing.assert_array_equal(measured.waypoint_positions, truth.waypoint_positions)
+    world, truth = begin(erring(dropout=1.0))
+    assert not len(world.sensors.measure(truth).neighbors.bodies)
+
+
+def test_measurements_are_used_after_the_delay():
+    world, truth = begin(erring(delay=0.3))
+    seen = [truth]
+    for step in range(8):
+        measured = world.sensors.measure(seen[-1])
+        np.testing.assert_array_equal(measured.waypoint_positions, seen[max(0, step - 3)].waypoint_positions)
+        seen.append(world.step(np.full((1, 12, 2), 0.1))[0])
+
+
+def test_a_flock_errs_alike_whoever_flies_beside_it():
+    scenario = erring(position_noise=0.01, dropout=0.2, delay=0.1)
+    many, few = (fly(make_controller("go-to-waypoint"), scenario.replace(max_cycles=20), 6, 0, batch) for batch in (6, 2))
+    for name in many:
+        np.testing.assert_array_equal(many[name], few[name])
+
+
+def test_reward_and_metrics_are_of_the_truth():
+    class Still:
+        def act(self, sensing, scenario):
+            return np.zeros((*sensing.waypoint_distances.shape, 2))
+
+    exact = evaluate(Still(), CROWD, episodes=3)
+    assert evaluate(Still(), erring(position_noise=0.5, dropout=0.5, delay=1.0), episodes=3) == exact
+
+
+def test_an_env_shows_what_is_measured_and_goes_on_from_its_state():
+    env = flocking_v0.parallel_env(erring(position_noise=0.02, dropout=0.2, delay=0.2))
+    exact = flocking_v0.parallel_env(CROWD)
+    observations, _ = env.reset(seed=3)
+    truth, _ = exact.reset(seed=3)
+    assert any(np.abs(observations[agent] - truth[agent]).max() > 0.1 for agent in env.agents)
+    actions = dict.fromkeys(env.agents, np.array([0.1, 0.5], dtype=np.float32))
+    _, rewards, *_, infos = env.step(actions)
+    _, exact_rewards, *_, exact_infos = exact.step(actions)
+    assert rewards == exact_rewards
+    assert all(infos[agent]["metrics"] == exact_infos[agent]["metrics"] for agent in env.agents)
+    other = flocking_v0.parallel_env(env.scenario)
+    other.load_state_dict(env.state_dict())
+    for _ in range(4):
+        ours, theirs = env.step(actions)[0], other.step(actions)[0]
+        for agent in env.agents:
+            np.testing.assert_array_equal(ours[agent], theirs[agent])
+
+
+def test_sense_is_always_exact():
+    world, truth = begin(erring(position_noise=0.5))
+    np.testing.assert_array_equal(sense(world).waypoint_positions, truth.waypoint_positions)
+
+
+@pytest.mark.parametrize(("name", "value"), [("position_noise", -1.0), ("dropout", 1.1), ("delay", float("nan"))])
+def test_mistakes_are_one_line(name, value):
+    with pytest.raises(SettingsError, match=f"{name} = "):
+        SensorErrors(**{name: value})
