@@ -95,7 +95,7 @@ class _Parser(argparse.ArgumentParser):
         super().__init__(allow_abbrev=False, **kwargs)
 
     def error(self, message: str) -> Any:
-        self.exit(USAGE_ERROR, f"{self.prog}: {message} (try {self.prog} --help)\n")
+        self.exit(USAGE_ERROR, f"{self.prog}: {UserError(message)} (try {self.prog} --help)\n")
 
 
 class _Version(argparse.Action):

@@ -123,7 +123,17 @@ words = st.one_of(
     st.text(max_size=6),
 )
 commands = st.sampled_from(
-    ["config", "evaluate", "evaluate no/such", "train --resume no/such/run", "reproduce --out /dev/null/x"]
+    [
+        "config",
+        "evaluate",
+        "evaluate no/such",
+        "train --resume no/such/run",
+        "reproduce --out /dev/null/x",
+        "render no/such --out flight.gif",
+        "play no/such",
+        "export no/such policy.onnx",
+        "compare no/such",
+    ]
 )
 
 
