@@ -209,6 +209,7 @@ def _add_evaluate(commands: Any) -> None:
     _add_flight_flags(parser)
     parser.add_argument("--episodes", type=_count(1), default=1000, metavar="N", help="episodes to fly [1000]")
     parser.add_argument("--json", metavar="FILE", help="write the metrics to this file, too")
+    parser.add_argument("--sensors", action="store_true", help="show how noise, missed detections and delay tell on it, too")
     parser.set_defaults(run=_evaluate)
 
 
@@ -278,7 +279,13 @@ def _evaluate(options: argparse.Namespace, words: Sequence[str]) -> int:
     if options.json is not None and not Path(options.json).absolute().parent.is_dir():
         raise SettingsError(f"--json {options.json}: there is no folder {Path(options.json).parent}")
     flyer, name, scenario = _flight_of(options)
-    metrics = _evaluate_and_print(flyer, name, scenario, options.episodes, options.seed, Console(stderr=True))
+    console = Console(stderr=True)
+    metrics = _evaluate_and_print(flyer, name, scenario, options.episodes, options.seed, console)
+    if options.sensors:
+        from sb3_flock.evaluation.robustness import errors_table, evaluate_with_errors
+
+        with console.status("flying with sensors that err"):
+            Console().print(errors_table(evaluate_with_errors(flyer, scenario, options.episodes, options.seed)))
     if options.json is not None:
         from sb3_flock.evaluation.report import write_json
         from sb3_flock.rl.saving import versions

@@ -12,12 +12,14 @@ import numpy as np
 from rich.console import Console
 
 from sb3_flock.envs.vec_env import make_vec_env
+from sb3_flock.evaluation import robustness
 from sb3_flock.evaluation.controllers import CONTROLLERS, make_controller
 from sb3_flock.evaluation.episodes import evaluate
 from sb3_flock.evaluation.figures import check_matplotlib, lines, observation, record, save, trajectories
 from sb3_flock.evaluation.metrics import Metric
 from sb3_flock.evaluation.model_cards import median_of_seeds, read_card
 from sb3_flock.evaluation.report import PAPER
+from sb3_flock.evaluation.robustness import evaluate_with_errors
 from sb3_flock.rl.algorithms import build_model
 from sb3_flock.rl.callbacks import NeighborInclusiveReward
 from sb3_flock.rl.config import TrainingConfig
@@ -94,6 +96,8 @@ def reproduce(out: str | Path, quick: bool = False, console: Console | None = No
         parts.append(_training_curve(folder))
         status.update("one policy with 1 to 200 vehicles")
         parts.append(_fleets(folder, policies["general"], size.fleet_episodes))
+        status.update("sensors that err")
+        parts.append(_sensors(policies["paper-5v2o"], size.episodes // 4 or 1))
         status.update("time of training against the number of vehicles")
         parts.append(_training_time(folder, size.timed_steps))
     (folder / "results.md").write_text("\n\n".join(parts) + "\n", encoding="utf-8")
@@ -221,6 +225,17 @@ def _fleets(folder: Path, policy: LoadedPolicy, episodes: int) -> str:
     }
     save(lines(series, "vehicles", "meters or share", log_x=True), folder / "fleets")
     return "\n".join([*lines_, "\n![metrics against vehicles](fleets.png)"])
+
+
+def _sensors(policy: LoadedPolicy, episodes: int) -> str:
+    rows = evaluate_with_errors(policy, policy.scenario, episodes)
+    lines_ = [
+        "## Sensors that err\n",
+        f"`paper-5v2o`, trained with exact ones; {episodes} episodes a row (`sb3-flock evaluate paper-5v2o --sensors`):\n",
+        "| sensor errors | " + " | ".join(robustness.COLUMNS) + " |",
+        "|---" * (len(robustness.COLUMNS) + 1) + "|",
+    ]
+    return "\n".join([*lines_, *(f"| {name} | " + " | ".join(robustness.cells(row)) + " |" for name, row in rows.items())])
 
 
 def densest_tracking(n_vehicles: int, separation: float = 0.1) -> float:

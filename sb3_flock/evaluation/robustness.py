@@ -1,0 +1,56 @@
+"""How a policy's metrics fall as its sensors err: noise, missed detections and delay, each alone."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rich import box
+from rich.table import Table
+
+from sb3_flock.evaluation.episodes import evaluate
+from sb3_flock.evaluation.metrics import Metric
+from sb3_flock.sim import Scenario
+from sb3_flock.sim.sensors import SensorErrors
+
+COLUMNS = {
+    "tracking": ("tracking_error", "{:.3f}"),
+    "too close": ("neighbor_violation_rate", "{:.2%}"),
+    "obstacle": ("obstacle_violation_rate", "{:.2%}"),
+    "connected": ("connectivity", "{:.1%}"),
+}
+"""The metrics shown: heading, name and format."""
+
+
+def sensor_errors(scenario: Scenario) -> dict[str, SensorErrors]:
+    """Errors by their name, from none to large: noise in parts of the link range, delay in steps."""
+    noise = [round(scenario.link_range * share, 12) for share in (1 / 30, 1 / 15, 2 / 15, 4 / 15)]
+    delays = [round(scenario.time_step * steps, 12) for steps in (1, 2, 4, 8)]
+    return {
+        "none": SensorErrors(),
+        **{f"noise of {value:g} m": SensorErrors(position_noise=value) for value in noise},
+        **{f"{share:.0%} of detections missed": SensorErrors(dropout=share) for share in (0.1, 0.3, 0.5)},
+        **{f"delay of {value:g} s": SensorErrors(delay=value) for value in delays},
+    }
+
+
+def evaluate_with_errors(policy: Any, scenario: Scenario, episodes: int, seed: int = 0) -> dict[str, dict[str, Metric]]:
+    """The metrics under each of :func:`sensor_errors`; the parameters are those of :func:`~sb3_flock.evaluation.evaluate`."""
+    rows = sensor_errors(scenario).items()
+    return {name: evaluate(policy, scenario.replace(sensors=errors), episodes, seed) for name, errors in rows}
+
+
+def cells(row: dict[str, Metric]) -> list[str]:
+    """One row's numbers as they are shown."""
+    values = [(row[name].mean, pattern) for name, pattern in COLUMNS.values()]
+    return ["-" if value is None else pattern.format(value) for value, pattern in values]
+
+
+def errors_table(rows: dict[str, dict[str, Metric]]) -> Table:
+    """The metrics under each error, a line each."""
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    table.add_column("sensor errors", no_wrap=True)
+    for heading in COLUMNS:
+        table.add_column(heading, justify="right", no_wrap=True)
+    for name, row in rows.items():
+        table.add_row(name, *cells(row))
+    return table
