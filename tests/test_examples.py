@@ -33,6 +33,24 @@ def test_evaluating_a_policy(tmp_path):
     assert run("evaluate_policy.py", tmp_path / "ddpg_3v1o_1", cwd=tmp_path).count("vehicles:") == 4
 
 
+def test_a_custom_extractor_trains(tmp_path):
+    said = run("custom_extractor.py", 1200, cwd=tmp_path)
+    assert "FlatMLP" in said
+    assert "tracking error" in said
+
+
+def test_a_policy_beside_olfati_saber(tmp_path):
+    said = run("beside_olfati_saber.py", "paper-3v1o", 10, cwd=tmp_path)
+    assert [line.split(":")[0].strip() for line in said.splitlines()] == ["ours", "Olfati-Saber"]
+    assert (tmp_path / "beside_olfati_saber.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_parameter_sharing(tmp_path):
+    said = run("parameter_sharing.py", cwd=tmp_path)
+    assert "decided alone, the same: True" in said
+    assert "[[1" in said
+
+
 def test_flying_on_board_needs_numpy_and_onnxruntime_alone(tmp_path):
     assert main(["export", "paper-5v2o", str(tmp_path / "policy.onnx")]) == 0
     said = run("fly_onboard.py", tmp_path / "policy.onnx", cwd=tmp_path)

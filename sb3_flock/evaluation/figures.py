@@ -79,6 +79,23 @@ def save_as(figure: Figure, path: Path, kind: str) -> None:
 def trajectories(flight: Flight) -> Figure:
     """Paths of vehicles, obstacles and waypoint over one episode: circles at the starts, filled shapes at the ends."""
     figure, axes = new_figure(5.4, 5.0)
+    _draw_flight(axes, flight)
+    return figure
+
+
+def flights(by_name: Mapping[str, Flight]) -> Figure:
+    """The :func:`trajectories` of several flights side by side, on one scale."""
+    figure, axes = new_figure(0.4 + 5.0 * len(by_name), 5.0, columns=len(by_name))
+    panels = np.atleast_1d(axes)
+    for panel, (name, flight) in zip(panels, by_name.items(), strict=True):
+        _draw_flight(panel, flight)
+        panel.set_title(name)
+        panel.sharex(panels[0])
+        panel.sharey(panels[0])
+    return figure
+
+
+def _draw_flight(axes: Axes, flight: Flight) -> None:
     scenario = flight.scenario
     groups = (
         ("vehicles", np.moveaxis(flight.positions, 1, 0), _VEHICLE, "-", "^"),
@@ -98,7 +115,6 @@ def trajectories(flight: Flight) -> Figure:
     axes.margins(0.08)
     axes.grid(alpha=0.3)
     axes.legend(loc="best", fontsize=8)
-    return figure
 
 
 def _circle(axes: Axes, center: NDArray[np.float64], radius: float, color: str) -> None:
