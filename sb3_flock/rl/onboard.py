@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
+import io
 import json
 import logging
 import time
 import warnings
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -103,7 +104,10 @@ class Onboard(nn.Module):
         positions = th.cat([positions, th.full((1, 2), 10 * reach, dtype=th.float64)])
         in_reach = _norm(positions) < reach
         factors = th.exp(-0.5 * ((positions[:, :, None] - anchors) / sigma).square())
-        return (in_reach[:, None].double() * factors[:, 0]).T @ factors[:, 1]
+        along_x = in_reach[:, None].double() * factors[:, 0]
+        return (along_x[:, :, None] * factors[:, 1, None, :]).sum(
+            0
+        )  # not a product of matrices: not all runtimes have its kernel
 
 
 def _norm(vectors: th.Tensor) -> th.Tensor:
@@ -206,13 +210,13 @@ def random_situations(scenario: Scenario, count: int, seed: int) -> Iterator[tup
         yield (neighbors, obstacles, sensing.waypoint_positions[0, 0]), observe(sensing, world.scenario)[0, 0]
 
 
-@contextmanager
+@contextlib.contextmanager
 def _quiet_exporter() -> Iterator[None]:
     """The exporter of torch tells of its own workings, not of the policy."""
     before = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
             warnings.simplefilter("ignore")
             yield
     finally:
