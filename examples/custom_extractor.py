@@ -7,7 +7,7 @@ from stable_baselines3 import DDPG
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-from sb3_flock import FlockPolicy, NeighborInclusiveReward, Scenario, evaluate, make_vec_env
+from sb3_flock import FlockPolicy, NeighborInclusiveReward, Scenario, evaluate, make_vec_env, render
 
 
 class FlatMLP(BaseFeaturesExtractor):
@@ -29,3 +29,4 @@ model = DDPG(FlockPolicy, env, policy_kwargs=policy_kwargs, learning_starts=1000
 model.learn(int(sys.argv[1]) if len(sys.argv) > 1 else 30_000, NeighborInclusiveReward(lambda_=0.7))
 print(model.policy.actor.features_extractor)
 print(f"tracking error {evaluate(model, scenario, episodes=20)['tracking_error'].mean:.3f} m")
+render(model, scenario, "custom_extractor.png")

@@ -1,4 +1,4 @@
-"""The neighbor-inclusive reward on somebody else's env: MPE2's simple_spread (pip install mpe2).
+"""The neighbor-inclusive reward on somebody else's env: MPE2's simple_spread (pip install mpe2 pillow).
 
 All the callback needs is ``info["neighbors"]``: the indices into ``possible_agents`` of each agent's neighbors.
 """
@@ -8,6 +8,7 @@ import sys
 import numpy as np
 from mpe2 import simple_spread_v3
 from pettingzoo.utils import BaseParallelWrapper
+from PIL import Image
 from stable_baselines3 import DDPG
 
 from sb3_flock import NeighborInclusiveReward, flatten
@@ -25,7 +26,9 @@ class NeighborsWithinOne(BaseParallelWrapper):
         return observations, rewards, terminations, truncations, infos
 
 
-env = NeighborsWithinOne(simple_spread_v3.parallel_env(N=3, local_ratio=1.0, continuous_actions=True))
-model = DDPG("MlpPolicy", flatten(env, n_copies=4, seed=0), learning_starts=500, buffer_size=50_000, gradient_steps=2)
+spread = simple_spread_v3.parallel_env(N=3, local_ratio=1.0, continuous_actions=True, render_mode="rgb_array")
+env = flatten(NeighborsWithinOne(spread), n_copies=4, seed=0)
+model = DDPG("MlpPolicy", env, learning_starts=500, buffer_size=50_000, gradient_steps=2)
 model.learn(int(sys.argv[1]) if len(sys.argv) > 1 else 20_000, callback=NeighborInclusiveReward(lambda_=0.5))
 print(f"{model.num_timesteps} transitions, mean stored reward {model.replay_buffer.rewards[:100].mean():.3f}")
+Image.fromarray(env.render()).save("neighbors_of_another_env.png")

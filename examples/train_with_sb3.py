@@ -6,7 +6,7 @@ import numpy as np
 from stable_baselines3 import DDPG
 from stable_baselines3.common.noise import NormalActionNoise
 
-from sb3_flock import FlockCNN, NeighborInclusiveReward, Scenario, evaluate, make_vec_env
+from sb3_flock import FlockCNN, NeighborInclusiveReward, Scenario, evaluate, make_vec_env, render
 
 steps = int(sys.argv[1]) if len(sys.argv) > 1 else 100_000
 scenario = Scenario(n_vehicles=3, n_obstacles=1)
@@ -24,3 +24,4 @@ model = DDPG(
 model.learn(steps, callback=NeighborInclusiveReward(lambda_=0.7))
 model.save("flock_ddpg")
 print(evaluate(model, scenario, episodes=100)["tracking_error"])
+render(model, scenario, "train_with_sb3.png")  # or .gif, .mp4, .html

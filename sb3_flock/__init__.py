@@ -16,11 +16,13 @@ if TYPE_CHECKING:
     from sb3_flock.envs import flocking_v0
     from sb3_flock.envs.vec_env import flatten, make_vec_env
     from sb3_flock.evaluation import evaluate
+    from sb3_flock.evaluation.film import render
     from sb3_flock.rl.callbacks import NeighborInclusiveReward
     from sb3_flock.rl.config import TrainingConfig
     from sb3_flock.rl.ddpg import FlockDDPG
     from sb3_flock.rl.extractor import FlockCNN
     from sb3_flock.rl.loading import load_policy
+    from sb3_flock.rl.onboard import export
     from sb3_flock.rl.policy import FlockPolicy, FlockSACPolicy
     from sb3_flock.rl.replay import CompactReplayBuffer
     from sb3_flock.rl.saving import save_model
@@ -39,10 +41,12 @@ __all__ = [
     "TrainingConfig",
     "World",
     "evaluate",
+    "export",
     "flatten",
     "flocking_v0",
     "load_policy",
     "make_vec_env",
+    "render",
     "resume",
     "save_model",
     "train",
@@ -60,9 +64,11 @@ _HOMES = {
     "TrainingConfig": "rl.config",
     "World": "sim",
     "evaluate": "evaluation",
+    "export": "rl.onboard",
     "flatten": "envs.vec_env",
     "load_policy": "rl.loading",
     "make_vec_env": "envs.vec_env",
+    "render": "evaluation.film",
     "save_model": "rl.saving",
     "resume": "rl.training",
     "train": "rl.training",

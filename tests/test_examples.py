@@ -19,24 +19,28 @@ def run(name, *arguments, cwd):
 def test_the_sb3_script_is_short_trains_and_saves(tmp_path):
     assert "mean=" in run("train_with_sb3.py", 2400, cwd=tmp_path)
     assert (tmp_path / "flock_ddpg.zip").exists()
+    assert (tmp_path / "train_with_sb3.png").exists()
     code = (EXAMPLES / "train_with_sb3.py").read_text().splitlines()
     assert len([line for line in code if line.strip() and not line.startswith('"""')]) < 25
 
 
 def test_another_env(tmp_path):
     assert "2004 transitions" in run("neighbors_of_another_env.py", 2000, cwd=tmp_path)
+    assert (tmp_path / "neighbors_of_another_env.png").exists()
 
 
 def test_evaluating_a_policy(tmp_path):
     words = ["train", "--total-timesteps", "60", "--eval-freq", "0", "--output-dir", str(tmp_path)]
     assert main([*words, "--set", "test_episodes=1", "--set", "buffer_size=100"]) == 0
     assert run("evaluate_policy.py", tmp_path / "ddpg_3v1o_1", cwd=tmp_path).count("vehicles:") == 4
+    assert (tmp_path / "evaluate_policy.png").exists()
 
 
 def test_a_custom_extractor_trains(tmp_path):
     said = run("custom_extractor.py", 1200, cwd=tmp_path)
     assert "FlatMLP" in said
     assert "tracking error" in said
+    assert (tmp_path / "custom_extractor.png").exists()
 
 
 def test_a_policy_beside_olfati_saber(tmp_path):

@@ -42,6 +42,7 @@ _VEHICLE = (0, 114, 178)
 _VIOLATION = (213, 94, 0)
 _OBSTACLE = (204, 121, 167)
 _WAYPOINT = (0, 0, 0)
+PALETTE = (_BACKGROUND, _GRID, _TEXT, _LINK, _VEHICLE, _VIOLATION, _OBSTACLE, _WAYPOINT)
 
 Color = tuple[int, int, int]
 Pixels = tuple[float, float]

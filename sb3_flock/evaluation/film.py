@@ -92,11 +92,17 @@ def _pictures(policy: Any, scenario: Scenario, seed: int, episode: int, stride: 
 def _write_gif(path: Path, pictures: Iterator[Picture], fps: float, title: str) -> None:
     from PIL import Image
 
+    from sb3_flock.envs.rendering import PALETTE
+
     frames = [Image.fromarray(picture) for picture in pictures]
     some = frames[:: max(1, len(frames) // 8)]
-    together = Image.new("RGB", (some[0].width, some[0].height * len(some)))
+    width, height = some[0].size
+    together = Image.new("RGB", (width, height * (len(some) + 1)))
     for place, frame in enumerate(some):
-        together.paste(frame, (0, place * frame.height))
+        together.paste(frame, (0, place * height))
+    band = height // len(PALETTE)
+    for place, color in enumerate(PALETTE):  # colors that are seldom there are kept as well
+        together.paste(color, (0, height * len(some) + place * band, width, height * len(some) + (place + 1) * band))
     palette = together.quantize(_COLORS, dither=Image.Dither.NONE)
     first, *others = (frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
     first.save(path, "GIF", save_all=True, append_images=others, duration=round(1000 / fps), loop=0)

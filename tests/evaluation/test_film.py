@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from sb3_flock.cli import main
-from sb3_flock.envs.rendering import HEADER, SIDE
+from sb3_flock.envs.rendering import HEADER, PALETTE, SIDE
 from sb3_flock.evaluation.controllers import make_controller
 from sb3_flock.evaluation.film import render
 from sb3_flock.settings import SettingsError
@@ -32,6 +32,8 @@ def test_a_gif_moves_in_the_time_it_should(tmp_path, flyer):
         first = np.asarray(film.convert("RGB"))
         film.seek(30)
         assert (np.asarray(film.convert("RGB")) != first).any(-1).mean() > 0.005
+    for color in PALETTE:
+        assert (np.abs(first.astype(int) - color).max(-1) < 12).any()
     assert list(tmp_path.iterdir()) == [path]
 
 
