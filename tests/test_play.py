@@ -10,7 +10,7 @@ import pytest
 from PIL import Image, ImageGrab
 
 from sb3_flock.cli import main
-from sb3_flock.envs.rendering import HEADER, SIDE
+from sb3_flock.envs.rendering import HEADER, SIDE, Renderer
 from sb3_flock.evaluation.controllers import make_controller
 from sb3_flock.play import Game, play
 from sb3_flock.rl.loading import load_policy
@@ -172,6 +172,10 @@ def test_a_real_window_with_a_real_mouse_and_keys(screen, tmp_path):
     def xdotool(*words):
         return subprocess.run(["xdotool", *map(str, words)], check=False, capture_output=True, text=True).stdout.strip()
 
+    def point_at(x, y):
+        xdotool("mousemove", "--window", window, round(x), round(y))
+        time.sleep(0.3)
+
     def wait_for(said, seconds=60):
         deadline = time.monotonic() + seconds
         while said not in (title := xdotool("getwindowname", window)):
@@ -179,31 +183,41 @@ def test_a_real_window_with_a_real_mouse_and_keys(screen, tmp_path):
             time.sleep(0.05)
 
     command = [sys.executable, "-m", "sb3_flock.cli", "play", "--controller", "go-to-waypoint", "--n-vehicles", "4"]
-    process = subprocess.Popen([*command, "--set", "waypoint_speed=0", "--set", "obstacle_max_speed=0"])
+    process = subprocess.Popen([*command, "--set", "waypoint_route=[[0.5, 0.5]]", "--set", "obstacle_max_speed=0"])
     try:
         window, deadline = "", time.monotonic() + 60
         while not window:
             window = xdotool("search", "--onlyvisible", "--class", ".")
             assert time.monotonic() < deadline
         wait_for("4 vehicles, 1 obstacle")
-        xdotool("mousemove", "--window", window, 60, HEADER + 60)
-        time.sleep(0.3)
+        point_at(60, HEADER + 60)
         xdotool("click", 1)
         wait_for("2 obstacles")
         xdotool("key", "space")
         wait_for("paused")
-        xdotool("mousemove", "--window", window, 160, HEADER + 60)
+        point_at(160, HEADER + 60)
         xdotool("key", "plus")
         wait_for("5 vehicles")
         xdotool("key", "v")
         wait_for("vehicle 0 is watched")
+        renderer = Renderer(Scenario(), "rgb_array", fps=0)
+        here, there = renderer.pixels_of((0.5, 0.5)), renderer.pixels_of((0.8, -0.8))
+        point_at(*here)
+        xdotool("mousedown", 1)
+        point_at(*there)
+        xdotool("mouseup", 1)
         picture = ImageGrab.grab(xdisplay=screen)
         picture.save(tmp_path / "window.png")
-        obstacle = (np.asarray(picture) == np.array((204, 121, 167))).all(-1)
-        corner = np.argwhere((np.asarray(picture) == 255).all(-1)).min(0)  # of the window on the black screen
-        assert obstacle[corner[0] + HEADER + 60, corner[1] + 60]
-        xdotool("mousemove", "--window", window, 60, HEADER + 60)
-        time.sleep(0.3)
+        colors = np.asarray(picture)
+        corner = np.argwhere((colors == 255).all(-1)).min(0)  # of the window on the black screen
+
+        def color_at(x, y):
+            return tuple(colors[corner[0] + round(y), corner[1] + round(x)].tolist())
+
+        assert color_at(60, HEADER + 60) == (204, 121, 167)  # the obstacle
+        assert color_at(*there) == (0, 0, 0)  # the waypoint's cross
+        assert color_at(*here) != (0, 0, 0)
+        point_at(60, HEADER + 60)
         xdotool("click", 1)
         wait_for("1 obstacle,")
         xdotool("key", "q")
