@@ -84,30 +84,26 @@ class Onboard(nn.Module):
 
     def forward(self, neighbors: th.Tensor, obstacles: th.Tensor, waypoint: th.Tensor) -> th.Tensor:
         """The deterministic action, ``(2,)``."""
-        scenario = self.scenario
-        on_circle = waypoint / (_norm(waypoint) / scenario.goal_radius).clamp(min=1.0)
-        near, wide, goal = scenario.channel_radii
-        tensor = th.stack(
-            [
-                self._channel(neighbors, scenario.link_range, near),
-                self._channel(obstacles, scenario.detection_range, wide),
-                self._channel(on_circle[None], 2 * goal, goal),
-            ]
-        )
+        on_circle = waypoint / (_norm(waypoint) / self.scenario.goal_radius).clamp(min=1.0)
+        tensor = self._tensor(neighbors, obstacles, on_circle[None])
         action = self.actor(tensor[None])[0]
         return self.low + (action + 1) / 2 * (self.high - self.low)
 
-    def _channel(self, positions: th.Tensor, reach: float, radius: float) -> th.Tensor:
-        anchors = th.linspace(-radius, radius, self.scenario.n_anchors, dtype=th.float64)
-        sigma = self.scenario.anchor_width * 2 * radius / (self.scenario.n_anchors - 1)
-        # One more body, out of reach: runtimes disagree about sums over none.
-        positions = th.cat([positions, th.full((1, 2), 10 * reach, dtype=th.float64)])
-        in_reach = _norm(positions) < reach
-        factors = th.exp(-0.5 * ((positions[:, :, None] - anchors) / sigma).square())
-        along_x = in_reach[:, None].double() * factors[:, 0]
-        return (along_x[:, :, None] * factors[:, 1, None, :]).sum(
-            0
-        )  # not a product of matrices: not all runtimes have its kernel
+    def _tensor(self, *bodies: th.Tensor) -> th.Tensor:
+        """All three channels at once, for speed: bodies marked by their channel's number, lengths in units of its sigma."""
+        scenario, side = self.scenario, self.scenario.n_anchors
+        radii = th.tensor(scenario.channel_radii, dtype=th.float64)
+        reach = th.tensor([scenario.link_range, scenario.detection_range, 2 * scenario.goal_radius], dtype=th.float64)
+        anchors = th.linspace(-1, 1, side, dtype=th.float64) * (side - 1) / (2 * scenario.anchor_width)
+        marked = th.cat(
+            [nn.functional.pad(positions, (0, 1), value=float(number)) for number, positions in enumerate(bodies)]
+        )
+        positions, channel = marked[:, :2], marked[:, 2].long()
+        sigma = scenario.anchor_width * 2 * radii / (side - 1)
+        factors = th.exp(-0.5 * ((positions / sigma[channel, None])[:, :, None] - anchors).square())
+        spots = (factors[:, 0, :, None] * factors[:, 1, None, :]).flatten(1)
+        counts = (channel == th.arange(3)[:, None]) & (_norm(positions) < reach[channel])
+        return (counts.double() @ spots).view(3, side, side)
 
 
 def _norm(vectors: th.Tensor) -> th.Tensor:
@@ -182,14 +178,16 @@ def _metadata(policy: LoadedPolicy) -> dict[str, Any]:
 def _compare(session: Any, policy: LoadedPolicy, count: int, seed: int) -> tuple[float, float]:
     """Largest difference to ``predict`` and median time of a decision."""
     space: Any = policy.policy.action_space
-    worst, times = 0.0, []
-    for situation, tensor in random_situations(policy.scenario, count, seed):
+    situations = list(random_situations(policy.scenario, count, seed))
+    actions, times = [], []
+    for situation, _ in situations:
         start = time.perf_counter()
         (action,) = session.run(None, dict(zip(INPUTS, situation, strict=True)))
         times.append(time.perf_counter() - start)
-        expected, _ = policy.predict(tensor, deterministic=True)
-        worst = max(worst, float((np.abs(action - expected) / (space.high - space.low)).max()))
-    return worst, float(np.median(times))
+        actions.append(action)
+    expected = np.stack([policy.predict(tensor, deterministic=True)[0] for _, tensor in situations])
+    difference = np.abs(np.stack(actions) - expected) / (space.high - space.low)
+    return float(difference.max()), float(np.median(times))
 
 
 def random_situations(scenario: Scenario, count: int, seed: int) -> Iterator[tuple[Situation, NDArray[np.float32]]]:
