@@ -297,10 +297,8 @@ def _evaluate(options: argparse.Namespace, words: Sequence[str]) -> int:
             "scenario": scenario.model_dump(mode="json"),
             "evaluated_with": versions(),
         }
-        try:
+        with _disk_errors_told(f"--json {options.json}"):
             write_json(options.json, metrics, meta)
-        except OSError as error:
-            raise SettingsError(f"--json {options.json}: {error.strerror or error}") from None
     return 0
 
 
@@ -330,6 +328,15 @@ def _warnings_told() -> Iterator[None]:
         print(f"sb3-flock: warning: {warning.message}", file=sys.stderr)
 
 
+@contextlib.contextmanager
+def _disk_errors_told(what: str) -> Iterator[None]:
+    """A file that cannot be written is a user's mistake, in one line."""
+    try:
+        yield
+    except OSError as error:
+        raise SettingsError(f"{what}: {error.strerror or error}") from None
+
+
 # -- render ----------------------------------------------------------------------------------------------------------
 
 
@@ -357,11 +364,8 @@ def _render(options: argparse.Namespace, words: Sequence[str]) -> int:
     flyer, name, scenario = _flight_of(options)
     th.set_num_threads(1)
     title = f"{options.policy or name}: {scenario.bodies}, episode {options.episode} of seed {options.seed}"
-    with _warnings_told(), Console(stderr=True).status("flying"):
-        try:
-            path = render(flyer, scenario, options.out, options.seed, options.episode, options.speed, title)
-        except OSError as error:
-            raise SettingsError(f"--out {options.out}: {error.strerror or error}") from None
+    with _warnings_told(), Console(stderr=True).status("flying"), _disk_errors_told(f"--out {options.out}"):
+        path = render(flyer, scenario, options.out, options.seed, options.episode, options.speed, title)
     print(path)
     return 0
 
@@ -420,10 +424,8 @@ def _export(options: argparse.Namespace, words: Sequence[str]) -> int:
 
     th.set_num_threads(1)
     policy = _load_policy(options.policy, "cpu", options.trust)
-    try:
+    with _disk_errors_told(f"export {options.out}"):
         done = export(policy, options.out)
-    except OSError as error:
-        raise SettingsError(f"export {options.out}: {error.strerror or error}") from None
     print(
         f"differs from the policy by at most {done.difference:.1g} of the range in {done.situations} situations; "
         f"{1000 * done.latency:.3f} ms a decision (median, one core)",
@@ -463,10 +465,8 @@ def _compare(options: argparse.Namespace, words: Sequence[str]) -> int:
     if differences is not None:
         console.print(differences)
     if options.out is not None:
-        try:
+        with _disk_errors_told(f"--out {options.out}"):
             save_as(curves_figure(runs), Path(options.out), Path(options.out).suffix[1:])
-        except OSError as error:
-            raise SettingsError(f"--out {options.out}: {error.strerror or error}") from None
         print(options.out)
     return 0
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_flock.evaluation.episodes import as_controller
+from sb3_flock.evaluation.film import check_speed
 from sb3_flock.settings import SettingsError
 from sb3_flock.sim import Scenario, Sensing, World, episode_rng, observe, sense
 
@@ -232,8 +233,7 @@ def play(policy: Any, scenario: Scenario, seed: int = 0, speed: float = 2.0) -> 
     :param speed: times real time
     :raises SettingsError: without a display, without pygame, or for a speed that is not accepted
     """
-    if not 0.01 <= speed <= 1000:
-        raise SettingsError(f"--speed {speed:g}: from 0.01 to 1000 times real time is needed")
+    check_speed(speed)
     try:
         pygame.display.init()
         has_display = pygame.display.get_driver() not in {"dummy", "offscreen"} or "SDL_VIDEODRIVER" in os.environ

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
 from itertools import cycle
+from operator import getitem
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +19,7 @@ from rich.table import Table
 from sb3_flock.evaluation.figures import LINE_STYLES, new_figure
 from sb3_flock.rl.config import TrainingConfig
 from sb3_flock.rl.config_io import load_config
-from sb3_flock.settings import SettingsError
+from sb3_flock.settings import SettingsError, leaf_paths
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -106,8 +108,8 @@ def _thousands(steps: float) -> str:
 
 def differences_table(runs: Sequence[Run]) -> Table | None:
     """The config's fields that are not the same in all runs, or ``None`` if there are none."""
-    configs = [dict(_leaves(run.config.model_dump(mode="json"))) for run in runs]
-    rows = {name: [config[name] for config in configs] for name in configs[0]}
+    configs = [run.config.model_dump(mode="json") for run in runs]
+    rows = {".".join(path): [reduce(getitem, path, config) for config in configs] for path in leaf_paths(TrainingConfig)}
     differing = {name: values for name, values in rows.items() if any(value != values[0] for value in values)}
     if not differing:
         return None
@@ -118,14 +120,6 @@ def differences_table(runs: Sequence[Run]) -> Table | None:
     for name, values in differing.items():
         table.add_row(name, *("null" if value is None else str(value) for value in values))
     return table
-
-
-def _leaves(values: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for name, value in values.items():
-        if isinstance(value, dict):
-            yield from _leaves(value, f"{prefix}{name}.")
-        else:
-            yield prefix + name, value
 
 
 def curves_figure(runs: Sequence[Run]) -> Figure:

@@ -67,8 +67,7 @@ def check_film(path: Path, speed: float) -> None:
     :raises SettingsError: one line
     """
     check_figure_file(path, (*FILMS, *FIGURES))
-    if not 0.01 <= speed <= 1000:
-        raise SettingsError(f"--speed {speed:g}: from 0.01 to 1000 times real time is needed")
+    check_speed(speed)
     if path.suffix in FIGURES:
         return
     try:
@@ -77,6 +76,15 @@ def check_film(path: Path, speed: float) -> None:
         import pygame  # noqa: F401
     except ImportError as error:
         raise SettingsError(f"--out {path}: {error.name} is needed: pip install 'sb3_flock[render]'") from None
+
+
+def check_speed(speed: float) -> None:
+    """Whether a speed is accepted.
+
+    :raises SettingsError: if not
+    """
+    if not 0.01 <= speed <= 1000:
+        raise SettingsError(f"--speed {speed:g}: from 0.01 to 1000 times real time is needed")
 
 
 def _pictures(policy: Any, scenario: Scenario, seed: int, episode: int, stride: int) -> Iterator[Picture]:
