@@ -67,12 +67,8 @@ def fly(
     results = []
     for start in range(0, episodes, batch):
         numbers = range(start, min(start + batch, episodes))
-        world = World(scenario, len(numbers))
         metrics = EpisodeMetrics(scenario, len(numbers))
-        rngs = [episode_rng(seed, episode) for episode in numbers]
-        sensing = world.reset(rngs)
-        if hasattr(controller, "reset"):
-            controller.reset(rngs, scenario)
+        world, sensing = _begin(controller, scenario, [episode_rng(seed, episode) for episode in numbers])
         for _ in range(scenario.max_cycles):
             sensing, clipped = world.step(controller.act(world.sensors.measure(sensing), scenario))
             metrics.update(world, sensing, own_reward(reward_terms(sensing, clipped, scenario)))
@@ -88,14 +84,21 @@ def fly_one(policy: Any, scenario: Scenario, seed: int = 0, episode: int = 0) ->
     """
     check_integer("seed", seed, 0)
     check_integer("episode", episode, 0)
-    controller, world, rngs = as_controller(policy, scenario), World(scenario), [episode_rng(seed, episode)]
-    sensing = world.reset(rngs)
-    if hasattr(controller, "reset"):
-        controller.reset(rngs, scenario)
+    controller = as_controller(policy, scenario)
+    world, sensing = _begin(controller, scenario, [episode_rng(seed, episode)])
     yield world
     for _ in range(scenario.max_cycles):
         sensing, _ = world.step(controller.act(world.sensors.measure(sensing), scenario))
         yield world
+
+
+def _begin(controller: Controller, scenario: Scenario, rngs: list[np.random.Generator]) -> tuple[World, Sensing]:
+    """A world at the start of its episodes, one a generator, and what is sensed there; the controller is told."""
+    world = World(scenario, len(rngs))
+    sensing = world.reset(rngs)
+    if hasattr(controller, "reset"):
+        controller.reset(rngs, scenario)
+    return world, sensing
 
 
 def as_controller(policy: Any, scenario: Scenario) -> Controller:
