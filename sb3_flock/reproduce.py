@@ -18,7 +18,7 @@ from sb3_flock.evaluation.episodes import evaluate
 from sb3_flock.evaluation.figures import check_matplotlib, lines, observation, record, save, trajectories
 from sb3_flock.evaluation.metrics import Metric
 from sb3_flock.evaluation.model_cards import median_of_seeds, read_card
-from sb3_flock.evaluation.report import PAPER
+from sb3_flock.evaluation.report import PAPER, SHORT_COLUMNS
 from sb3_flock.evaluation.robustness import evaluate_with_errors
 from sb3_flock.rl.algorithms import build_model
 from sb3_flock.rl.callbacks import NeighborInclusiveReward
@@ -232,8 +232,8 @@ def _sensors(policy: LoadedPolicy, episodes: int) -> str:
     lines_ = [
         "## Sensors that err\n",
         f"`paper-5v2o`, trained with exact ones; {episodes} episodes a row (`sb3-flock evaluate paper-5v2o --sensors`):\n",
-        "| sensor errors | " + " | ".join(robustness.COLUMNS) + " |",
-        "|---" * (len(robustness.COLUMNS) + 1) + "|",
+        "| sensor errors | " + " | ".join(heading for heading, _ in SHORT_COLUMNS.values()) + " |",
+        "|---" * (len(SHORT_COLUMNS) + 1) + "|",
     ]
     return "\n".join([*lines_, *(f"| {name} | " + " | ".join(robustness.cells(row)) + " |" for name, row in rows.items())])
 

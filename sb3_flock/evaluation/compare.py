@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich import box
 from rich.table import Table
 
 from sb3_flock.evaluation.figures import LINE_STYLES, new_figure
+from sb3_flock.evaluation.report import SHORT_COLUMNS, plain_table
 from sb3_flock.rl.config import TrainingConfig
 from sb3_flock.rl.config_io import load_config
 from sb3_flock.settings import SettingsError, leaf_paths
@@ -24,13 +24,6 @@ from sb3_flock.settings import SettingsError, leaf_paths
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_COLUMNS = {
-    "tracking_error": ("tracking", "{:.3f}"),
-    "neighbor_violation_rate": ("too close", "{:.2%}"),
-    "obstacle_violation_rate": ("obstacle", "{:.2%}"),
-    "connectivity": ("connected", "{:.1%}"),
-}
-"""The metrics that are compared: heading and format."""
 _TITLES = {
     "tracking_error": "tracking error [m]",
     "connectivity": "share of settled steps connected",
@@ -69,7 +62,7 @@ def _load(folder: Path, name: str) -> Run:
     config = load_config(TrainingConfig, folder / "config.yaml")
     try:
         with np.load(folder / "evaluations.npz", allow_pickle=False) as file:
-            curves = {key: file[key] for key in ("timesteps", "seconds", "score", *_COLUMNS)}
+            curves = {key: file[key] for key in ("timesteps", "seconds", "score", *SHORT_COLUMNS)}
     except FileNotFoundError:
         raise SettingsError(f"compare {folder}: there is no evaluation yet (evaluations.npz)") from None
     except (OSError, ValueError, KeyError, EOFError, MemoryError, zipfile.BadZipFile) as error:
@@ -90,13 +83,13 @@ def _shortest_names(paths: Sequence[str]) -> list[str]:
 
 def results_table(runs: Sequence[Run]) -> Table:
     """The best evaluation of each run, and when it was."""
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    table = plain_table()
     table.add_column("run", overflow="fold")
-    for heading in ("best at", "of", "min", *(heading for heading, _ in _COLUMNS.values())):
+    for heading in ("best at", "of", "min", *(heading for heading, _ in SHORT_COLUMNS.values())):
         table.add_column(heading, justify="right", no_wrap=True)
     for run in runs:
         curves, best = run.curves, run.best
-        values = [pattern.format(float(curves[metric][best])) for metric, (_, pattern) in _COLUMNS.items()]
+        values = [pattern.format(float(curves[metric][best])) for metric, (_, pattern) in SHORT_COLUMNS.items()]
         when = f"{_thousands(curves['timesteps'][best])}", f"{_thousands(run.config.total_timesteps)}"
         table.add_row(run.name, *when, f"{float(curves['seconds'][-1]) / 60:.0f}", *values)
     return table
@@ -113,7 +106,7 @@ def differences_table(runs: Sequence[Run]) -> Table | None:
     differing = {name: values for name, values in rows.items() if any(value != values[0] for value in values)}
     if not differing:
         return None
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    table = plain_table()
     table.add_column("differs", no_wrap=True)
     for run in runs:
         table.add_column(run.name, overflow="fold", justify="right")

@@ -50,10 +50,24 @@ PAPER: dict[tuple[int, int], dict[str, dict[str, float]]] = {
 _RATES = ("obstacle_violation_rate", "neighbor_violation_rate", "connectivity", "success_rate")
 
 
+SHORT_COLUMNS = {
+    "tracking_error": ("tracking", "{:.3f}"),
+    "neighbor_violation_rate": ("too close", "{:.2%}"),
+    "obstacle_violation_rate": ("obstacle", "{:.2%}"),
+    "connectivity": ("connected", "{:.1%}"),
+}
+"""The metrics of a narrow table: heading and format."""
+
+
+def plain_table() -> Table:
+    """An empty table in the style of all of ours."""
+    return Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+
+
 def metrics_table(metrics: dict[str, Metric], scenario: Scenario) -> Table:
     """All metrics with their intervals, beside the paper's figures where it has some for as many vehicles and obstacles."""
     paper = PAPER.get((scenario.n_vehicles, scenario.n_obstacles), {})
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    table = plain_table()
     table.add_column("metric", no_wrap=True)
     for heading in ("mean", "95 % interval", "worst", *(f"paper {name.removeprefix('Table ')}" for name in paper)):
         table.add_column(heading, justify="right", no_wrap=True)

@@ -4,21 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from rich import box
 from rich.table import Table
 
 from sb3_flock.evaluation.episodes import evaluate
 from sb3_flock.evaluation.metrics import Metric
+from sb3_flock.evaluation.report import SHORT_COLUMNS, plain_table
 from sb3_flock.sim import Scenario
 from sb3_flock.sim.sensors import SensorErrors
-
-COLUMNS = {
-    "tracking": ("tracking_error", "{:.3f}"),
-    "too close": ("neighbor_violation_rate", "{:.2%}"),
-    "obstacle": ("obstacle_violation_rate", "{:.2%}"),
-    "connected": ("connectivity", "{:.1%}"),
-}
-"""The metrics shown: heading, name and format."""
 
 
 def sensor_errors(scenario: Scenario) -> dict[str, SensorErrors]:
@@ -41,15 +33,15 @@ def evaluate_with_errors(policy: Any, scenario: Scenario, episodes: int, seed: i
 
 def cells(row: dict[str, Metric]) -> list[str]:
     """One row's numbers as they are shown."""
-    values = [(row[name].mean, pattern) for name, pattern in COLUMNS.values()]
+    values = [(row[name].mean, pattern) for name, (_, pattern) in SHORT_COLUMNS.items()]
     return ["-" if value is None else pattern.format(value) for value, pattern in values]
 
 
 def errors_table(rows: dict[str, dict[str, Metric]]) -> Table:
     """The metrics under each error, a line each."""
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    table = plain_table()
     table.add_column("sensor errors", no_wrap=True)
-    for heading in COLUMNS:
+    for heading, _ in SHORT_COLUMNS.values():
         table.add_column(heading, justify="right", no_wrap=True)
     for name, row in rows.items():
         table.add_row(name, *cells(row))
