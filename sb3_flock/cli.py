@@ -84,6 +84,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_export(commands)
     _add_compare(commands)
     _add_reproduce(commands)
+    _add_sweep(commands)
     _add_config(commands)
     return parser
 
@@ -493,6 +494,80 @@ def _reproduce(options: argparse.Namespace, words: Sequence[str]) -> int:
 
     th.set_num_threads(1)
     print(reproduce(options.out, options.quick))
+    return 0
+
+
+# -- sweep -----------------------------------------------------------------------------------------------------------
+
+
+def _add_sweep(commands: Any) -> None:
+    parser = commands.add_parser(
+        "sweep",
+        help="train, or fly a policy, at many settings at once, on one machine or a Ray cluster",
+        description="Train at every point of a grid or a search, as many at once as the cores carry; rank the settings.",
+        epilog="example: sb3-flock sweep configs/sweep_lambda.yaml --set total_timesteps=20000",
+    )
+    parser.add_argument("file", nargs="?", metavar="FILE", help="YAML file that says what to vary, over which config")
+    parser.add_argument(
+        "--resume",
+        metavar="DIR",
+        help="go on with the sweep in this folder: unfinished and failed trials from their last checkpoints; Ray keeps its "
+        "state as pickles, which run any code in them, so go on with your own sweeps only",
+    )
+    parser.add_argument("--evaluate", metavar="POLICY", help=f"fly this policy at every point instead: {_POLICY_HELP}")
+    parser.add_argument("--episodes", type=_count(1), metavar="N", help="episodes a point, with --evaluate [1000]")
+    parser.add_argument("--address", metavar="ADDRESS", help="a running Ray cluster's, or auto [this machine alone]")
+    parser.add_argument(
+        "--out",
+        metavar="DIR",
+        help="new folder, shared by the cluster's machines, or a URL such as s3://... [sweeps/FILE_<k>]",
+    )
+    _add_set(parser, "total_timesteps=20000, for every trial")
+    parser.set_defaults(run=_sweep)
+
+
+def _sweep(options: argparse.Namespace, words: Sequence[str]) -> int:
+    from sb3_flock.rl.config_io import parse_overrides
+    from sb3_flock.sweep.config import load_sweep
+    from sb3_flock.sweep.run import default_out, resume_sweep, sweep
+
+    if (options.file is None) == (options.resume is None):
+        raise SettingsError("sweep: a FILE or --resume DIR is needed, and not both")
+    if options.resume is not None:
+        given = [flag for flag in ("evaluate", "episodes", "out", "set") if getattr(options, flag)]
+        if given:
+            raise SettingsError(f"--resume and --{given[0]}: the sweep's folder has a config of its own")
+        config, trials = resume_sweep(options.resume, options.address)
+        out = options.resume
+    else:
+        flags = (("policy", options.evaluate), ("episodes", options.episodes))
+        changes = {name: value for name, value in flags if value is not None}
+        config = load_sweep(options.file, parse_overrides(options.set), **changes)
+        policy = None
+        if config.policy is not None:
+            from sb3_flock.rl.loading import load_policy
+
+            policy = load_policy(config.policy).path.read_bytes()
+        out = options.out or default_out(options.file)
+        trials = sweep(config, out, options.address, policy)
+    return _report_sweep(config, trials, out)
+
+
+def _report_sweep(config: Any, trials: Sequence[Any], out: str) -> int:
+    from rich.console import Console
+
+    from sb3_flock.sweep.statistics import report
+
+    console = Console()
+    for table in report(config, trials, out):
+        console.print(table)
+    for trial in trials:
+        if trial.why:
+            print(f"sb3-flock: {trial.name}: {trial.status}: {trial.why}", file=sys.stderr)
+    print(out)
+    unfinished = [trial for trial in trials if trial.status in ("failed", "unfinished")]
+    if unfinished:
+        raise RunError(f"{len(unfinished)} of {len(trials)} trials did not end; to go on: sb3-flock sweep --resume {out}")
     return 0
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,7 +67,7 @@ def save(figure: Figure, stem: str | Path) -> None:
         save_as(figure, Path(f"{stem}.{kind}"), kind)
 
 
-def save_as(figure: Figure, path: Path, kind: str) -> None:
+def save_as(figure: Figure, path: Path | BinaryIO, kind: str) -> None:
     """Write a ``"png"`` or an ``"svg"``, whatever the file's name."""
     import matplotlib as mpl
 

@@ -33,6 +33,9 @@ METRICS = {
 MINIMA = ("min_separation_obstacles", "encounter_min_separation_obstacles", "min_separation_neighbors")
 """Metrics whose worst episode is reported too."""
 
+LARGER_IS_BETTER = (*MINIMA, "connectivity", "success_rate", "return")
+"""Metrics of which more is better; of all others, and of :func:`score`, less."""
+
 _RESAMPLES = 10_000
 _CONFIDENCE = 0.95
 

@@ -38,7 +38,7 @@ def load_config(
     """
     values: dict[str, Any] = {} if base is None else base.model_dump()
     if path is not None:
-        values = _read_yaml(Path(path))
+        values = read_yaml(Path(path))
     _check_groups(settings, values, "")
     for key, value in (overrides or {}).items():
         *groups, name = resolve_path(settings, key)
@@ -83,9 +83,14 @@ def _lines(config: Settings, indent: str) -> Iterable[str]:
             yield f"{indent}{name}: {text.removesuffix('...' + chr(10)).strip()} # {field.description}"
 
 
-def _read_yaml(path: Path) -> dict[str, Any]:
+def read_yaml(path: Path, text: str | None = None) -> dict[str, Any]:
+    """A YAML file's mapping; an empty file's is empty.
+
+    :param text: the file's text, if it was read already
+    :raises SettingsError: one line for a file that cannot be read or holds no mapping
+    """
     try:
-        values = yaml.load(path.read_text(encoding="utf-8"), _Loader)
+        values = yaml.load(path.read_text(encoding="utf-8") if text is None else text, _Loader)
     except OSError as error:
         raise SettingsError(f"config {path}: {error.strerror or error}") from None
     except (yaml.YAMLError, ValueError, RecursionError) as error:

@@ -74,10 +74,14 @@ class Checkpoints(BaseCallback):
             path.unlink()
 
 
+class DivergedError(RunError):
+    """A loss is no longer finite: to go on from the last checkpoint would end there again."""
+
+
 class FiniteLosses(BaseCallback):
     """Stops a training whose losses are no longer finite, before anything of it is saved.
 
-    :raises RunError: one line that names the loss
+    :raises DivergedError: one line that names the loss
     """
 
     def _on_step(self) -> bool:
@@ -86,7 +90,7 @@ class FiniteLosses(BaseCallback):
     def _on_rollout_start(self) -> None:
         for name, value in self.logger.name_to_value.items():
             if name.startswith("train/") and name.endswith("loss") and not np.isfinite(value):
-                raise RunError(
+                raise DivergedError(
                     f"{name} = {value} after {self.num_timesteps} transitions: the training diverged; a smaller "
                     "learning_rate or reward scale may help"
                 )

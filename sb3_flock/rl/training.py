@@ -220,7 +220,7 @@ def _faults_told(folder: Path) -> Iterator[None]:
         where = folder if error.filename is None else os.fsdecode(error.filename)
         raise RunError(f"{where}: {error.strerror or error}; {_go_on(folder)}") from error
     except RunError as error:
-        raise RunError(f"{error}; {_go_on(folder)}") from error
+        raise type(error)(f"{error}; {_go_on(folder)}") from error
 
 
 def _go_on(folder: Path) -> str:

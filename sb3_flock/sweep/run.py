@@ -1,0 +1,288 @@
+"""Runs a sweep by Ray Tune: on this machine or a cluster, in a folder from which it can go on."""
+
+from __future__ import annotations
+
+import csv
+import importlib.util
+import io
+import logging
+import os
+import posixpath
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sb3_flock.evaluation.metrics import METRICS
+from sb3_flock.rl.config_io import to_yaml
+from sb3_flock.settings import SettingsError
+from sb3_flock.sweep.config import SweepConfig, is_whole, load_sweep
+
+if TYPE_CHECKING:
+    from fsspec import AbstractFileSystem
+
+_CONFIG, _POLICY, RESULTS = "sweep.yaml", "policy.zip", "results.csv"
+
+
+@dataclass(frozen=True)
+class Trial:
+    """How one trial ended."""
+
+    name: str
+    point: dict[str, Any]
+    status: str
+    """``done``, ``diverged``, ``refused`` or ``failed``, which alone a resumed sweep tries again."""
+    why: str
+    metrics: dict[str, float]
+    """Means over the episodes of the test: :data:`~sb3_flock.evaluation.metrics.METRICS` and ``score``; empty if not done."""
+    report: dict[str, Any]
+    """The trial's last report."""
+    run: str
+    """Where its run folder is; empty if nothing was saved."""
+
+
+class Folder:
+    """Where a sweep's results go: a local or shared folder, or any URL that fsspec knows.
+
+    :raises SettingsError: for a URL that cannot be used
+    """
+
+    def __init__(self, out: str) -> None:
+        import fsspec
+
+        try:
+            self.filesystem: AbstractFileSystem
+            self.filesystem, path = fsspec.core.url_to_fs(out)
+        except (ImportError, ValueError, OSError) as error:
+            raise SettingsError(f"--out {out}: {' '.join(str(error).split())}") from None
+        self.name = out
+        self.path = path.rstrip("/")
+        self.is_plain = "://" not in out and "::" not in out
+
+    def of(self, name: str) -> str:
+        """Path of a file in it."""
+        return posixpath.join(self.path, name)
+
+    def exists(self, name: str = "") -> bool:
+        """Whether there is a file of this name."""
+        with self.faults_told():
+            return bool(self.filesystem.exists(self.of(name) if name else self.path))
+
+    def write(self, name: str, data: bytes) -> None:
+        """Write a file."""
+        with self.faults_told():
+            self.filesystem.makedirs(self.path, exist_ok=True)
+            self.filesystem.pipe_file(self.of(name), data)
+
+    def read(self, name: str) -> bytes:
+        """A file's bytes."""
+        with self.faults_told():
+            return bytes(self.filesystem.cat_file(self.of(name)))
+
+    @contextmanager
+    def faults_told(self) -> Iterator[None]:
+        """What goes wrong with the storage, in one line."""
+        try:
+            yield
+        except OSError as error:
+            raise SettingsError(f"--out {self.name}: {error.strerror or ' '.join(str(error).split())}") from None
+
+    def for_ray(self) -> dict[str, Any]:
+        """As Ray Tune takes it; a plain path it handles itself, and checks that all machines share it."""
+        if self.is_plain:
+            return {}
+        from pyarrow.fs import FSSpecHandler, PyFileSystem
+
+        return {"storage_filesystem": PyFileSystem(FSSpecHandler(self.filesystem))}
+
+
+def sweep(config: SweepConfig, out: str, address: str | None = None, policy: bytes | None = None) -> list[Trial]:
+    """Run every trial, and leave ``results.csv`` and each trial's run folder in ``out``.
+
+    :param config: what to vary
+    :param out: a new folder, or the URL of one
+    :param address: a running Ray cluster's, such as ``"auto"``; ``None`` starts one on this machine's cores
+    :param policy: the zip of ``config.policy``, if there is one
+    :raises SettingsError: for a value of a point that is not accepted, or a folder that cannot be used
+    :raises RunError: if Ray does not run
+    """
+    _check_installed()
+    _check_points(config, policy)
+    folder = Folder(out)
+    if folder.exists():
+        raise SettingsError(f"--out {out}: it exists already; to go on with a sweep: sb3-flock sweep --resume {out}")
+    folder.write(_CONFIG, to_yaml(config).encode())
+    if policy is not None:
+        folder.write(_POLICY, policy)
+    return _run(config, folder, address, policy)
+
+
+def resume_sweep(out: str, address: str | None = None) -> tuple[SweepConfig, list[Trial]]:
+    """Go on with a sweep: unfinished trials from their last checkpoints, failed ones too.
+
+    Ray keeps the state of a sweep as pickles, which run any code that is in them: go on with your own sweeps only.
+
+    :param out: the folder of :func:`sweep`
+    :raises SettingsError: for a folder without a sweep
+    :raises RunError: if Ray does not run
+    """
+    _check_installed()
+    folder = Folder(out)
+    if not folder.exists(_CONFIG):
+        raise SettingsError(f"--resume {out}: not a sweep's folder (there is no {_CONFIG})")
+    config = load_sweep(_CONFIG, text=folder.read(_CONFIG).decode())
+    policy = folder.read(_POLICY) if config.policy is not None else None
+    return config, _run(config, folder, address, policy)
+
+
+def _check_installed() -> None:
+    missing = [name for name in ("ray", "optuna", "rliable") if importlib.util.find_spec(name) is None]
+    if missing:
+        raise SettingsError(f"a sweep needs {missing[0]}: pip install 'sb3_flock[ray]'")
+
+
+def _check_points(config: SweepConfig, policy: bytes | None) -> None:
+    """Whether every trial's config is accepted; better told now than by each trial."""
+    if policy is None:
+        for point in config.points():
+            if config.search and config.training(point).eval_freq == 0:
+                raise SettingsError("eval_freq = 0: a search needs evaluations")
+        return
+    from sb3_flock.sweep.trials import load_shipped
+
+    flyer = load_shipped(policy)
+    for point in config.points():
+        flyer.check(config.flight(point, flyer.scenario)[0])
+
+
+def _run(config: SweepConfig, folder: Folder, address: str | None, policy: bytes | None) -> list[Trial]:
+    os.environ.update(RAY_USAGE_STATS_ENABLED="0", TUNE_DISABLE_AUTO_CALLBACK_LOGGERS="1", RAY_AIR_NEW_OUTPUT="0")
+    import ray
+    from ray import tune
+
+    from sb3_flock.sweep.trials import evaluate_trial, train_trial
+
+    try:
+        ray.init(address=address or "local", include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
+    except (ConnectionError, ValueError, RuntimeError) as error:
+        raise SettingsError(f"--address {address}: {' '.join(str(error).split())}") from None
+    try:
+        values = config.model_dump(mode="json")
+        trial: Any = (
+            tune.with_parameters(train_trial, sweep=values)
+            if policy is None
+            else tune.with_parameters(evaluate_trial, sweep=values, policy=policy)
+        )
+        trial = tune.with_resources(trial, {"CPU": config.resources.cpus, "GPU": config.resources.gpus})
+        storage = folder.for_ray()
+        if tune.Tuner.can_restore(folder.path, **storage):
+            tuner = tune.Tuner.restore(folder.path, trial, resume_unfinished=True, resume_errored=True, **storage)
+        else:
+            tuner = _new_tuner(config, folder, trial, storage)
+        results = tuner.fit()
+        trials = [_ended(result) for result in results._experiment_analysis.trials]
+    finally:
+        ray.shutdown()
+    folder.write(RESULTS, _as_csv(config, trials).encode())
+    return trials
+
+
+def _new_tuner(config: SweepConfig, folder: Folder, trial: Any, storage: Mapping[str, Any]) -> Any:
+    import ray
+    from ray import tune
+
+    from sb3_flock.sweep.table import TrialsTable
+
+    space: dict[str, Any] = {key: tune.grid_search(values) for key, values in config.grid.items()}
+    settings: dict[str, Any] = {}
+    if config.search:
+        from ray.tune.search.optuna import OptunaSearch
+
+        space = {}
+        cores = ray.cluster_resources().get("CPU", 1)  # type: ignore[no-untyped-call]
+        at_once = max(1, int(cores) // config.resources.cpus)
+        searcher = OptunaSearch(_distributions(config), metric="score", mode="min", seed=config.search_seed)
+        settings = {"search_alg": searcher, "num_samples": config.trials, "max_concurrent_trials": at_once}
+    return tune.Tuner(
+        trial,
+        param_space=space,
+        tune_config=tune.TuneConfig(
+            trial_name_creator=trial_name, trial_dirname_creator=trial_name, reuse_actors=True, **settings
+        ),
+        run_config=tune.RunConfig(
+            name=posixpath.basename(folder.path),
+            storage_path=posixpath.dirname(folder.path),
+            failure_config=tune.FailureConfig(max_failures=config.retries),
+            checkpoint_config=tune.CheckpointConfig(num_to_keep=1),
+            callbacks=[TrialsTable()],
+            verbose=0,
+            **storage,
+        ),
+    )
+
+
+def trial_name(trial: Any) -> str:
+    """A trial's number and its point, as a folder's name."""
+    words = [f"{key.split('.')[-1]}={value}" for key, value in trial.config.items()]
+    return re.sub(r"[^\w.=+-]+", "_", "-".join([trial.trial_id.split("_")[-1], *words]))[:120]
+
+
+def _distributions(config: SweepConfig) -> dict[str, Any]:
+    from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
+
+    space: dict[str, Any] = {}
+    for key, choices in config.search.items():
+        if isinstance(choices, list):
+            space[key] = CategoricalDistribution(choices)
+        elif is_whole(key):
+            space[key] = IntDistribution(int(choices.low), int(choices.high), log=choices.log)
+        else:
+            space[key] = FloatDistribution(choices.low, choices.high, log=choices.log)
+    return space
+
+
+def _ended(trial: Any) -> Trial:
+    report = trial.last_result or {}
+    test = report.get("test", {})
+    failed = trial.status == "ERROR"
+    saved = trial.checkpoint
+    return Trial(
+        name=str(trial),
+        point=dict(trial.config),
+        status="failed" if failed else report.get("status", "unfinished"),
+        why=_first_cause(trial) if failed else report.get("why", ""),
+        metrics={name: float(test[name]) for name in (*METRICS, "score") if name in test},
+        report=report,
+        run="" if saved is None else str(saved.path),
+    )
+
+
+def _first_cause(trial: Any) -> str:
+    """The last line of what the trial's process raised: the error itself."""
+    try:
+        lines = str(trial.get_pickled_error() or trial.get_error()).strip().splitlines()
+    except Exception:
+        lines = []
+    return lines[-1] if lines else "no error was left"
+
+
+def _as_csv(config: SweepConfig, trials: Sequence[Trial]) -> str:
+    fields = [*(config.grid or config.search), "status", "timesteps", "minutes", *METRICS, "score", "run", "why"]
+    text = io.StringIO()
+    writer = csv.DictWriter(text, fields, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    for trial in trials:
+        about = {"status": trial.status, "run": trial.run, "why": trial.why}
+        writer.writerow({**trial.report, **trial.metrics, **trial.point, **about})
+    return text.getvalue()
+
+
+def default_out(file: str | Path) -> str:
+    """The next free ``sweeps/<name>_<k>``."""
+    stem = Path(file).stem
+    number = 1
+    while (Path("sweeps") / f"{stem}_{number}").exists():
+        number += 1
+    return str((Path("sweeps") / f"{stem}_{number}").resolve())

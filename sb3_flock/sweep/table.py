@@ -1,0 +1,114 @@
+"""A sweep while it runs: a live table in a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from typing import Any
+
+from ray import tune
+from rich.console import Console, Group
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from sb3_flock.evaluation.report import SHORT_COLUMNS, plain_table
+
+
+class TrialsTable(tune.Callback):
+    """The trials that run and those that ended last, with their latest evaluations.
+
+    Ray pickles it with the sweep's state and makes a new one when it goes on.
+    """
+
+    def __init__(self) -> None:
+        self.console = Console(stderr=True)
+        self._live: Live | None = None
+        self._drawn = 0.0
+        self._ended: list[Any] = []
+
+    def __reduce__(self) -> tuple[type[TrialsTable], tuple[()]]:
+        return type(self), ()
+
+    def on_step_end(self, iteration: int, trials: list[Any], **info: Any) -> None:
+        """Draw again, once a second at most."""
+        if self.console.is_terminal and time.monotonic() - self._drawn > 1.0:
+            self._draw(trials)
+
+    def on_trial_start(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
+        """A trial begins or goes on."""
+        self._tell(trials, f"{trial}: starts")
+
+    def on_trial_recover(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
+        """A trial was lost with its process or its machine, and will go on."""
+        self._tell(trials, f"{trial}: lost; goes on from its last checkpoint")
+
+    def on_trial_complete(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
+        """A trial has ended by itself."""
+        self._ended.append(trial)
+        named = zip((heading for heading, _ in SHORT_COLUMNS.values()), _cells(trial), strict=True)
+        self._tell(trials, f"{trial}: {', '.join([_state(trial), *(f'{name} {cell}' for name, cell in named if cell)])}")
+
+    def on_trial_error(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
+        """A trial has failed for good."""
+        self._ended.append(trial)
+        self._tell(trials, f"{trial}: failed")
+
+    def on_experiment_end(self, trials: list[Any], **info: Any) -> None:
+        """Leave the last table on the screen."""
+        if self._live is not None:
+            self._draw(trials)
+            self._live.stop()
+            self._live = None
+
+    def _tell(self, trials: list[Any], line: str) -> None:
+        if self.console.is_terminal:
+            self._draw(trials)
+        else:
+            counts = Counter(map(_state, trials))
+            self.console.print(
+                f"[{counts['done']} of {len(trials)} done] {line}", soft_wrap=True, markup=False, highlight=False
+            )
+
+    def _draw(self, trials: list[Any]) -> None:
+        self._drawn = time.monotonic()
+        if self._live is None:
+            self._live = Live(console=self.console, refresh_per_second=2)
+            self._live.start()
+        counts = Counter(map(_state, trials))
+        summary = ", ".join(f"{count} {state}" for state, count in counts.items())
+        self._live.update(Group(self._table(trials), Text(summary)))
+
+    def _table(self, trials: list[Any]) -> Table:
+        table = plain_table()
+        table.add_column("trial", ratio=1, no_wrap=True, overflow="ellipsis")
+        for heading in ("state", "done", *(heading for heading, _ in SHORT_COLUMNS.values())):
+            table.add_column(heading, justify="right", no_wrap=True)
+        running = [trial for trial in trials if trial.status == "RUNNING"]
+        room = max(4, self.console.height - 6)
+        running = running[:room]
+        ended = self._ended[len(self._ended) - min(len(self._ended), room - len(running)) :]
+        for trial in [*ended, *running]:
+            table.add_row(str(trial), _state(trial), _share(trial), *_cells(trial))
+        return table
+
+
+_STATES = {"PENDING": "waiting", "RUNNING": "running", "PAUSED": "waiting", "ERROR": "failed", "TERMINATED": "stopped"}
+
+
+def _state(trial: Any) -> str:
+    """As its last report says, or Ray."""
+    return str((trial.last_result or {}).get("status", _STATES[trial.status]))
+
+
+def _share(trial: Any) -> str:
+    report = trial.last_result or {}
+    total = report.get("total_timesteps")
+    return "" if total is None else f"{min(1.0, report['timesteps'] / total):.0%}"
+
+
+def _cells(trial: Any) -> list[str]:
+    """The test's metrics, or the last evaluation's."""
+    report = trial.last_result or {}
+    report = {**report, **report.get("test", {})}
+    return [pattern.format(report[name]) if name in report else "" for name, (_, pattern) in SHORT_COLUMNS.items()]

@@ -1,0 +1,153 @@
+"""What one trial of a sweep does, in a process of its own on any machine of the cluster."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch as th
+from ray import tune
+from rich.console import Console
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_flock.evaluation import evaluate
+from sb3_flock.evaluation.metrics import Metric, score
+from sb3_flock.evaluation.report import SHORT_COLUMNS
+from sb3_flock.rl.config import TrainingConfig
+from sb3_flock.rl.loading import LoadedPolicy, checkpoint_paths, load_policy
+from sb3_flock.rl.safety import DivergedError
+from sb3_flock.rl.training import resume, train
+from sb3_flock.settings import UserError
+from sb3_flock.sweep.config import SweepConfig
+
+TEST_SEED = 0
+"""Seed of the episodes that a trained policy is tested on: those of ``sb3-flock train``'s table, which nothing is chosen by."""
+
+DONE, DIVERGED, REFUSED = "done", "diverged", "refused"
+
+
+def train_trial(point: dict[str, Any], sweep: Mapping[str, Any]) -> None:
+    """Train at one point of a sweep, or go on from its last checkpoint, then test what was learned.
+
+    Whatever would end in the same way again is reported as the trial's status; anything else raises, and Ray tries again,
+    there or on another machine.
+
+    :param point: the trial's own fields of the training config
+    :param sweep: the :class:`~sb3_flock.sweep.config.SweepConfig`, as a mapping
+    """
+    config = SweepConfig(**sweep).training(point)
+    started = time.monotonic()
+    reports = Reports(config.total_timesteps)
+    try:
+        folder = _train_or_go_on(config, reports)
+        th.set_num_threads(1)
+        metrics = evaluate(load_policy(folder), config.scenario, config.test_episodes, TEST_SEED)
+        minutes = reports.row.get("minutes", (time.monotonic() - started) / 60)
+        ended = {"status": DONE, "timesteps": config.total_timesteps, "minutes": minutes}
+        tune.report({**reports.row, **ended, **_tested(metrics)}, checkpoint=tune.Checkpoint.from_directory(folder))
+    except DivergedError as error:
+        tune.report({**reports.row, "status": DIVERGED, "why": str(error), "score": float("inf")})
+    except UserError as error:
+        tune.report({**reports.row, "status": REFUSED, "why": str(error), "score": float("inf")})
+    finally:
+        shutil.rmtree(config.output_dir, ignore_errors=True)  # Ray keeps a copy, where it belongs
+
+
+def _train_or_go_on(config: TrainingConfig, reports: Reports) -> Path:
+    """The run folder, complete, in the trial's own working directory."""
+    console = Console(stderr=True, force_terminal=False, width=200)
+    saved = tune.get_checkpoint()
+    if saved is None:
+        return train(config, console, ["sb3-flock", "sweep"], callbacks=[reports]).folder
+    folder = Path(config.output_dir) / "resumed"
+    saved.to_directory(folder)
+    if not (folder / "final_model.zip").exists():
+        resume(folder, console, command=["sb3-flock", "sweep", "--resume"], callbacks=[reports])
+    return folder
+
+
+class Reports(BaseCallback):
+    """Tells Ray about every evaluation, and hands it a copy of the run folder after every checkpoint."""
+
+    def __init__(self, total_timesteps: int) -> None:
+        super().__init__()
+        self.row: dict[str, Any] = {"timesteps": 0, "total_timesteps": total_timesteps}
+        self._evaluated = 0
+        self._saved: Path | None = None
+
+    def _on_training_start(self) -> None:
+        folder = Path(self.logger.get_dir() or ".")
+        self._saved = _newest(folder)
+        self._evaluated = self._read_evaluations(folder)
+        tune.report(self.row)
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_start(self) -> None:
+        """The checkpoint that Ray gets is the one written before the last vector step, beside what was written since."""
+        folder = Path(self.logger.get_dir() or ".")
+        newest = _newest(folder)
+        if newest != self._saved:
+            self._saved, self.row["timesteps"] = newest, self.num_timesteps
+            self._evaluated = self._read_evaluations(folder)
+            tune.report(self.row, checkpoint=tune.Checkpoint.from_directory(folder))
+        elif (evaluated := _modified(folder / "evaluations.npz")) != self._evaluated:
+            self._read_evaluations(folder)
+            self._evaluated, self.row["timesteps"] = evaluated, self.num_timesteps
+            tune.report(self.row)
+
+    def _read_evaluations(self, folder: Path) -> int:
+        modified = _modified(folder / "evaluations.npz")
+        if modified:
+            with np.load(folder / "evaluations.npz", allow_pickle=False) as history:
+                self.row.update({name: float(history[name][-1]) for name in SHORT_COLUMNS})
+                self.row.update(score=float(history["score"].min()), minutes=float(history["seconds"][-1]) / 60)
+        return modified
+
+
+def _newest(folder: Path) -> Path | None:
+    saved = checkpoint_paths(folder)
+    return saved[-1] if saved else None
+
+
+def _modified(path: Path) -> int:
+    return path.stat().st_mtime_ns if path.exists() else 0
+
+
+def evaluate_trial(point: dict[str, Any], sweep: Mapping[str, Any], policy: bytes) -> None:
+    """Fly a policy at one point of a sweep.
+
+    :param policy: the policy's zip
+    """
+    th.set_num_threads(1)
+    config = SweepConfig(**sweep)
+    started = time.monotonic()
+    flyer = load_shipped(policy)
+    scenario, seed = config.flight(point, flyer.scenario)
+    try:
+        metrics = evaluate(flyer, scenario, config.episodes, seed)
+    except UserError as error:
+        tune.report({"status": REFUSED, "why": str(error)})
+        return
+    tune.report({"status": DONE, "minutes": (time.monotonic() - started) / 60, **_tested(metrics)})
+
+
+def load_shipped(policy: bytes) -> LoadedPolicy:
+    """A policy from the bytes of its zip."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "policy.zip"
+        path.write_bytes(policy)
+        return load_policy(path)
+
+
+def _tested(metrics: Mapping[str, Metric]) -> dict[str, Any]:
+    """The test's metrics as a report: the means, and their intervals."""
+    means = {name: np.nan if metric.mean is None else metric.mean for name, metric in metrics.items()}
+    spans = {name: (metric.low, metric.high) for name, metric in metrics.items()}
+    return {"test": {**means, "score": score(means)}, "intervals": spans}
