@@ -7,6 +7,7 @@ import contextlib
 import os
 import sys
 import warnings
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -565,9 +566,10 @@ def _report_sweep(config: Any, trials: Sequence[Any], out: str) -> int:
         if trial.why:
             print(f"sb3-flock: {trial.name}: {trial.status}: {trial.why}", file=sys.stderr)
     print(out)
-    unfinished = [trial for trial in trials if trial.status in ("failed", "unfinished")]
-    if unfinished:
-        raise RunError(f"{len(unfinished)} of {len(trials)} trials did not end; to go on: sb3-flock sweep --resume {out}")
+    ended = Counter(trial.status for trial in trials)
+    if open_ones := ended["failed"] + ended["unfinished"]:
+        print(f"sb3-flock: {open_ones} trials did not end; to go on: sb3-flock sweep --resume {out}", file=sys.stderr)
+        return INTERRUPTED if ended["unfinished"] else FAILED
     return 0
 
 

@@ -164,6 +164,7 @@ def _run(config: SweepConfig, folder: Folder, address: str | None, policy: bytes
 
     from sb3_flock.sweep.trials import evaluate_trial, train_trial
 
+    logging.getLogger("ray.tune").setLevel(logging.CRITICAL)  # tracebacks of lost machines; our table tells of them
     try:
         ray.init(address=address or "local", include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
     except (ConnectionError, ValueError, RuntimeError) as error:
@@ -183,6 +184,8 @@ def _run(config: SweepConfig, folder: Folder, address: str | None, policy: bytes
             tuner = _new_tuner(config, folder, trial, storage)
         results = tuner.fit()
         trials = [_ended(result) for result in results._experiment_analysis.trials]
+    except tune.TuneError as error:
+        raise RunError(f"{str(error).strip().splitlines()[-1]}; to go on: sb3-flock sweep --resume {folder.name}") from error
     finally:
         ray.shutdown()
     folder.write(RESULTS, _as_csv(config, trials).encode())
@@ -198,8 +201,10 @@ def _new_tuner(config: SweepConfig, folder: Folder, trial: Any, storage: Mapping
     space: dict[str, Any] = {key: tune.grid_search(values) for key, values in config.grid.items()}
     settings: dict[str, Any] = {}
     if config.search:
+        import optuna
         from ray.tune.search.optuna import OptunaSearch
 
+        optuna.logging.set_verbosity(optuna.logging.WARNING)
         space = {}
         cores = ray.cluster_resources().get("CPU", 1)  # type: ignore[no-untyped-call]
         at_once = max(1, int(cores) // config.resources.cpus)
@@ -225,8 +230,13 @@ def _new_tuner(config: SweepConfig, folder: Folder, trial: Any, storage: Mapping
 
 def trial_name(trial: Any) -> str:
     """A trial's number and its point, as a folder's name."""
-    words = [f"{key.split('.')[-1]}={value}" for key, value in trial.config.items()]
+    words = [f"{key.split('.')[-1]}={short(value)}" for key, value in trial.config.items()]
     return re.sub(r"[^\w.=+-]+", "_", "-".join([trial.trial_id.split("_")[-1], *words]))[:120]
+
+
+def short(value: Any) -> str:
+    """A value of a point as it is shown."""
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def _distributions(config: SweepConfig) -> dict[str, Any]:

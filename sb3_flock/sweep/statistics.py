@@ -22,7 +22,7 @@ from sb3_flock.evaluation.figures import LINE_STYLES, new_figure, save_as
 from sb3_flock.evaluation.metrics import LARGER_IS_BETTER
 from sb3_flock.evaluation.report import SHORT_COLUMNS, plain_table
 from sb3_flock.sweep.config import SweepConfig
-from sb3_flock.sweep.run import Folder, Trial
+from sb3_flock.sweep.run import Folder, Trial, short
 from sb3_flock.sweep.trials import DONE
 
 if TYPE_CHECKING:
@@ -89,12 +89,8 @@ def trials_table(config: SweepConfig, trials: Sequence[Trial]) -> Table:
     for trial in trials:
         values = {name: trial.metrics.get(name, np.nan) for name in SHORT_COLUMNS}
         cells = ["-" if np.isnan(value) else _pattern(name).format(value) for name, value in values.items()]
-        table.add_row(*(_short(trial.point[key]) for key in keys), *cells)
+        table.add_row(*(short(trial.point[key]) for key in keys), *cells)
     return table
-
-
-def _short(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def _pattern(metric: str) -> str:
@@ -134,7 +130,7 @@ def _by_setting(config: SweepConfig, trials: Sequence[Trial]) -> dict[str, list[
     keys = [key for key in config.grid if key != "seed" and key not in config.tasks]
     groups: dict[str, list[Trial]] = {}
     for trial in trials:
-        groups.setdefault(", ".join(f"{key.split('.')[-1]} {_short(trial.point[key])}" for key in keys) or "all", []).append(
+        groups.setdefault(", ".join(f"{key.split('.')[-1]} {short(trial.point[key])}" for key in keys) or "all", []).append(
             trial
         )
     return groups

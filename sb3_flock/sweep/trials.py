@@ -76,7 +76,7 @@ class Reports(BaseCallback):
 
     def __init__(self, total_timesteps: int) -> None:
         super().__init__()
-        self.row: dict[str, Any] = {"timesteps": 0, "total_timesteps": total_timesteps}
+        self.row: dict[str, Any] = {"timesteps": 0, "total_timesteps": total_timesteps, "score": float("inf")}
         self._evaluated = 0
         self._saved: Path | None = None
 
