@@ -544,13 +544,10 @@ def _sweep(options: argparse.Namespace, words: Sequence[str]) -> int:
         flags = (("policy", options.evaluate), ("episodes", options.episodes))
         changes = {name: value for name, value in flags if value is not None}
         config = load_sweep(options.file, parse_overrides(options.set), **changes)
-        policy = None
-        if config.policy is not None:
-            from sb3_flock.rl.loading import load_policy
-
-            policy = load_policy(config.policy).path.read_bytes()
+        if options.episodes is not None and config.policy is None:
+            raise SettingsError(f"--episodes {options.episodes}: only with --evaluate; a training has test_episodes")
         out = options.out or default_out(options.file)
-        trials = sweep(config, out, options.address, policy)
+        trials = sweep(config, out, options.address)
     return _report_sweep(config, trials, out)
 
 

@@ -7,7 +7,9 @@ import pytest
 from sb3_flock.rl.config import TrainingConfig
 from sb3_flock.rl.config_io import load_config, to_yaml
 
-CONFIGS = sorted((Path(__file__).parents[1] / "configs").glob("*.yaml"))
+CONFIGS = sorted(
+    path for path in (Path(__file__).parents[1] / "configs").glob("*.yaml") if not path.name.startswith("sweep_")
+)
 
 
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)

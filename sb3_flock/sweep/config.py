@@ -154,7 +154,11 @@ def load_sweep(
         shared = {name: value for name, value in whole.items() if name not in _GIVEN}
     if not isinstance(shared, Mapping):
         raise SettingsError(f"base = {shown(shared)}: a config's file or a mapping of its fields is needed")
-    values["base"] = _named_in_full([*_leaves(shared), *(base or {}).items()])
+    added = _named_in_full((base or {}).items())
+    idle = [name for name in added if values.get("policy") is not None and not name.startswith(_SCENARIO)]
+    if idle:
+        raise SettingsError(f"{idle[0]} does not tell on a flight, only the scenario's fields do")
+    values["base"] = {**_named_in_full(_leaves(shared)), **added}
     for name in ("grid", "search"):
         values[name] = _named_in_full((values.get(name) or {}).items())
     if isinstance(values.get("tasks"), list):

@@ -9,6 +9,7 @@ import logging
 import os
 import posixpath
 import re
+import socket
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from sb3_flock.evaluation.metrics import METRICS
 from sb3_flock.rl.config_io import to_yaml
-from sb3_flock.settings import SettingsError
+from sb3_flock.settings import RunError, SettingsError
 from sb3_flock.sweep.config import SweepConfig, is_whole, load_sweep
 
 if TYPE_CHECKING:
@@ -98,25 +99,26 @@ class Folder:
         return {"storage_filesystem": PyFileSystem(FSSpecHandler(self.filesystem))}
 
 
-def sweep(config: SweepConfig, out: str, address: str | None = None, policy: bytes | None = None) -> list[Trial]:
+def sweep(config: SweepConfig, out: str, address: str | None = None) -> list[Trial]:
     """Run every trial, and leave ``results.csv`` and each trial's run folder in ``out``.
 
     :param config: what to vary
     :param out: a new folder, or the URL of one
     :param address: a running Ray cluster's, such as ``"auto"``; ``None`` starts one on this machine's cores
-    :param policy: the zip of ``config.policy``, if there is one
-    :raises SettingsError: for a value of a point that is not accepted, or a folder that cannot be used
+    :raises SettingsError: for a value of a point that is not accepted, or a folder or an address that cannot be used
+    :raises PolicyError: for a policy that cannot be used
     :raises RunError: if Ray does not run
     """
-    _check_installed()
-    _check_points(config, policy)
+    _check_ray(address)
+    policy = _check_points(config)
     folder = Folder(out)
     if folder.exists():
         raise SettingsError(f"--out {out}: it exists already; to go on with a sweep: sb3-flock sweep --resume {out}")
-    folder.write(_CONFIG, to_yaml(config).encode())
-    if policy is not None:
-        folder.write(_POLICY, policy)
-    return _run(config, folder, address, policy)
+    with _cluster(config, address):
+        folder.write(_CONFIG, to_yaml(config).encode())
+        if policy is not None:
+            folder.write(_POLICY, policy)
+        return _run(config, folder, policy)
 
 
 def resume_sweep(out: str, address: str | None = None) -> tuple[SweepConfig, list[Trial]]:
@@ -128,47 +130,75 @@ def resume_sweep(out: str, address: str | None = None) -> tuple[SweepConfig, lis
     :raises SettingsError: for a folder without a sweep
     :raises RunError: if Ray does not run
     """
-    _check_installed()
+    _check_ray(address)
     folder = Folder(out)
     if not folder.exists(_CONFIG):
         raise SettingsError(f"--resume {out}: not a sweep's folder (there is no {_CONFIG})")
     config = load_sweep(_CONFIG, text=folder.read(_CONFIG).decode())
     policy = folder.read(_POLICY) if config.policy is not None else None
-    return config, _run(config, folder, address, policy)
+    with _cluster(config, address):
+        return config, _run(config, folder, policy)
 
 
-def _check_installed() -> None:
+def _check_points(config: SweepConfig) -> bytes | None:
+    """Whether every trial's config is accepted, which is better told now than by each trial; and the policy's zip."""
+    if config.policy is None:
+        for point in config.points():
+            trained = config.training(point)
+            if config.search and trained.eval_freq == 0:
+                raise SettingsError("eval_freq = 0: a search needs evaluations")
+        return None
+    from sb3_flock.rl.loading import load_policy
+
+    flyer = load_policy(config.policy)
+    for point in config.points():
+        flyer.check(config.flight(point, flyer.scenario)[0])
+    return flyer.path.read_bytes()
+
+
+def _check_ray(address: str | None) -> None:
+    """Whether all is installed, and a cluster answers, for which Ray would try for minutes."""
     missing = [name for name in ("ray", "optuna", "rliable") if importlib.util.find_spec(name) is None]
     if missing:
         raise SettingsError(f"a sweep needs {missing[0]}: pip install 'sb3_flock[ray]'")
-
-
-def _check_points(config: SweepConfig, policy: bytes | None) -> None:
-    """Whether every trial's config is accepted; better told now than by each trial."""
-    if policy is None:
-        for point in config.points():
-            if config.search and config.training(point).eval_freq == 0:
-                raise SettingsError("eval_freq = 0: a search needs evaluations")
+    if address is None:
         return
-    from sb3_flock.sweep.trials import load_shipped
+    from ray._private.services import canonicalize_bootstrap_address
 
-    flyer = load_shipped(policy)
-    for point in config.points():
-        flyer.check(config.flight(point, flyer.scenario)[0])
+    try:
+        found = canonicalize_bootstrap_address(address) or ""
+        host, _, port = found.removeprefix("ray://").rpartition(":")
+        socket.create_connection((host, int(port)), timeout=10).close()
+    except (OSError, ValueError) as error:
+        raise SettingsError(f"--address {address}: no Ray cluster answers there ({' '.join(str(error).split())})") from None
 
 
-def _run(config: SweepConfig, folder: Folder, address: str | None, policy: bytes | None) -> list[Trial]:
+@contextmanager
+def _cluster(config: SweepConfig, address: str | None) -> Iterator[None]:
+    """Ray, on this machine or where the address says, as long as it is needed."""
     os.environ.update(RAY_USAGE_STATS_ENABLED="0", TUNE_DISABLE_AUTO_CALLBACK_LOGGERS="1", RAY_AIR_NEW_OUTPUT="0")
     import ray
-    from ray import tune
-
-    from sb3_flock.sweep.trials import evaluate_trial, train_trial
 
     logging.getLogger("ray.tune").setLevel(logging.CRITICAL)  # tracebacks of lost machines; our table tells of them
     try:
         ray.init(address=address or "local", include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
     except (ConnectionError, ValueError, RuntimeError) as error:
         raise SettingsError(f"--address {address}: {' '.join(str(error).split())}") from None
+    try:
+        have = ray.cluster_resources()  # type: ignore[no-untyped-call]
+        for name, wanted in (("CPU", config.resources.cpus), ("GPU", config.resources.gpus)):
+            if address is None and wanted > have.get(name, 0):  # a cluster may grow
+                raise SettingsError(f"resources.{name.lower()}s = {wanted}: this machine has {have.get(name, 0):g}")
+        yield
+    finally:
+        ray.shutdown()
+
+
+def _run(config: SweepConfig, folder: Folder, policy: bytes | None) -> list[Trial]:
+    from ray import tune
+
+    from sb3_flock.sweep.trials import evaluate_trial, train_trial
+
     try:
         values = config.model_dump(mode="json")
         trial: Any = (
@@ -183,11 +213,9 @@ def _run(config: SweepConfig, folder: Folder, address: str | None, policy: bytes
         else:
             tuner = _new_tuner(config, folder, trial, storage)
         results = tuner.fit()
-        trials = [_ended(result) for result in results._experiment_analysis.trials]
+        trials = sorted((_ended(trial) for trial in results._experiment_analysis.trials), key=lambda trial: trial.name)
     except tune.TuneError as error:
         raise RunError(f"{str(error).strip().splitlines()[-1]}; to go on: sb3-flock sweep --resume {folder.name}") from error
-    finally:
-        ray.shutdown()
     folder.write(RESULTS, _as_csv(config, trials).encode())
     return trials
 
