@@ -41,7 +41,7 @@ class Trial:
     report: dict[str, Any]
     """The trial's last report."""
     run: str
-    """Where its run folder is; empty if nothing was saved."""
+    """Where its run folder is in the sweep's; empty if nothing was saved."""
 
 
 class Folder:
@@ -213,7 +213,8 @@ def _run(config: SweepConfig, folder: Folder, policy: bytes | None) -> list[Tria
         else:
             tuner = _new_tuner(config, folder, trial, storage)
         results = tuner.fit()
-        trials = sorted((_ended(trial) for trial in results._experiment_analysis.trials), key=lambda trial: trial.name)
+        ended = [_ended(trial, folder) for trial in results._experiment_analysis.trials]
+        trials = sorted(ended, key=lambda trial: trial.name)
     except tune.TuneError as error:
         raise RunError(f"{str(error).strip().splitlines()[-1]}; to go on: sb3-flock sweep --resume {folder.name}") from error
     folder.write(RESULTS, _as_csv(config, trials).encode())
@@ -281,7 +282,7 @@ def _distributions(config: SweepConfig) -> dict[str, Any]:
     return space
 
 
-def _ended(trial: Any) -> Trial:
+def _ended(trial: Any, folder: Folder) -> Trial:
     report = trial.last_result or {}
     test = report.get("test", {})
     failed = trial.status == "ERROR"
@@ -293,7 +294,7 @@ def _ended(trial: Any) -> Trial:
         why=_first_cause(trial) if failed else report.get("why", ""),
         metrics={name: float(test[name]) for name in (*METRICS, "score") if name in test},
         report=report,
-        run="" if saved is None else str(saved.path),
+        run="" if saved is None else posixpath.relpath(saved.path, folder.path),
     )
 
 

@@ -14,6 +14,9 @@ from rich.text import Text
 
 from sb3_flock.evaluation.report import SHORT_COLUMNS, plain_table
 
+_OTHER_COLUMNS = 54
+"""Width of the table beside the trials' names."""
+
 
 class TrialsTable(tune.Callback):
     """The trials that run and those that ended last, with their latest evaluations.
@@ -81,7 +84,7 @@ class TrialsTable(tune.Callback):
 
     def _table(self, trials: list[Any]) -> Table:
         table = plain_table()
-        table.add_column("trial", ratio=1, no_wrap=True, overflow="ellipsis")
+        table.add_column("trial", no_wrap=True, overflow="ellipsis", max_width=max(12, self.console.width - _OTHER_COLUMNS))
         for heading in ("state", "done", *(heading for heading, _ in SHORT_COLUMNS.values())):
             table.add_column(heading, justify="right", no_wrap=True)
         running = [trial for trial in trials if trial.status == "RUNNING"]

@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
 import torch as th
@@ -70,7 +69,7 @@ def assert_the_same_as_trained_alone(file, out, tmp_path):
     for point in config.points():
         row = rows[point["seed"]]
         alone = train(config.training(point).replace(output_dir=str(tmp_path / "alone")), quiet())
-        flown = load_policy(os.path.join(row["run"], "final_model.zip")).policy.state_dict()
+        flown = load_policy(out / row["run"] / "final_model.zip").policy.state_dict()
         for name, tensor in alone.model.policy.state_dict().items():
             assert th.equal(tensor, flown[name]), (point, name)
 
@@ -91,7 +90,7 @@ def test_a_grid_leaves_run_folders_a_table_and_a_ranking_and_survives_what_diver
     assert output.splitlines()[-1] == f"local://{out}"
     for row in rows:
         if row["status"] == "done":
-            assert load_policy(row["run"]).config.total_timesteps == 420
+            assert load_policy(out / row["run"]).config.total_timesteps == 420
             assert float(row["tracking_error"]) > 0
     for name in ("sweep.yaml", "ranking.csv", "ranking.png", "ranking.svg"):
         assert (out / name).stat().st_size > 0
@@ -133,7 +132,7 @@ def test_a_killed_node_s_trial_goes_on_on_the_other(tmp_path):
         cluster.shutdown()
     assert code == 0, errors
     assert errors.count("lost; goes on from its last checkpoint") == 1
-    commands = [(Path(row["run"]) / "command.txt").read_text() for row in results(out)]
+    commands = [(out / row["run"] / "command.txt").read_text() for row in results(out)]
     assert sorted(command.count("--resume") for command in commands) == [0, 1]
     assert_the_same_as_trained_alone(file, out, tmp_path)
 
