@@ -45,6 +45,7 @@ def train_trial(point: dict[str, Any], sweep: Mapping[str, Any]) -> None:
     reports = Reports(config.total_timesteps)
     try:
         folder = _train_or_go_on(config, reports)
+        reports.read(folder)
         th.set_num_threads(1)
         metrics = evaluate(load_policy(folder), config.scenario, config.test_episodes, TEST_SEED)
         minutes = reports.row.get("minutes", (time.monotonic() - started) / 60)
@@ -77,47 +78,37 @@ class Reports(BaseCallback):
     def __init__(self, total_timesteps: int) -> None:
         super().__init__()
         self.row: dict[str, Any] = {"timesteps": 0, "total_timesteps": total_timesteps, "score": float("inf")}
-        self._evaluated = 0
-        self._saved: Path | None = None
+        self._seen: tuple[Path | None, int] = (None, 0)
 
     def _on_training_start(self) -> None:
-        folder = Path(self.logger.get_dir() or ".")
-        self._saved = _newest(folder)
-        self._evaluated = self._read_evaluations(folder)
-        tune.report(self.row)
+        self._seen = self.read(self._folder)
+        self.row["timesteps"] = self.num_timesteps
+        tune.report(dict(self.row))
 
     def _on_step(self) -> bool:
         return True
 
     def _on_rollout_start(self) -> None:
         """The checkpoint that Ray gets is the one written before the last vector step, beside what was written since."""
-        folder = Path(self.logger.get_dir() or ".")
-        newest = _newest(folder)
-        if newest != self._saved:
-            self._saved, self.row["timesteps"] = newest, self.num_timesteps
-            self._evaluated = self._read_evaluations(folder)
-            tune.report(self.row, checkpoint=tune.Checkpoint.from_directory(folder))
-        elif (evaluated := _modified(folder / "evaluations.npz")) != self._evaluated:
-            self._read_evaluations(folder)
-            self._evaluated, self.row["timesteps"] = evaluated, self.num_timesteps
-            tune.report(self.row)
+        before, self._seen = self._seen, self.read(self._folder, self._seen)
+        if self._seen != before:
+            self.row["timesteps"] = self.num_timesteps
+            is_saved = self._seen[0] != before[0]
+            tune.report(dict(self.row), checkpoint=tune.Checkpoint.from_directory(self._folder) if is_saved else None)
 
-    def _read_evaluations(self, folder: Path) -> int:
-        modified = _modified(folder / "evaluations.npz")
-        if modified:
-            with np.load(folder / "evaluations.npz", allow_pickle=False) as history:
-                self.row.update({name: float(history[name][-1]) for name in SHORT_COLUMNS})
-                self.row.update(score=float(history["score"].min()), minutes=float(history["seconds"][-1]) / 60)
-        return modified
+    @property
+    def _folder(self) -> Path:
+        return Path(self.logger.get_dir() or ".")
 
-
-def _newest(folder: Path) -> Path | None:
-    saved = checkpoint_paths(folder)
-    return saved[-1] if saved else None
-
-
-def _modified(path: Path) -> int:
-    return path.stat().st_mtime_ns if path.exists() else 0
+    def read(self, folder: Path, seen: tuple[Path | None, int] = (None, 0)) -> tuple[Path | None, int]:
+        """The newest checkpoint and the time of the last evaluation, which goes into the row unless it was seen."""
+        saved, history = checkpoint_paths(folder)[-1:], folder / "evaluations.npz"
+        evaluated = history.stat().st_mtime_ns if history.exists() else 0
+        if evaluated != seen[1]:
+            with np.load(history, allow_pickle=False) as curves:
+                self.row.update({name: float(curves[name][-1]) for name in SHORT_COLUMNS})
+                self.row.update(score=float(curves["score"].min()), minutes=float(curves["seconds"][-1]) / 60)
+        return saved[0] if saved else None, evaluated
 
 
 def evaluate_trial(point: dict[str, Any], sweep: Mapping[str, Any], policy: bytes) -> None:
