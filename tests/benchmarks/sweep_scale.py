@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import os
 import subprocess
 import sys
 import tempfile
@@ -18,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 TRAINING = {
-    "total_timesteps": 30_000, "eval_freq": 0, "save_freq": 10_000, "keep_checkpoints": 1, "test_episodes": 1,
+    "total_timesteps": 10_000, "eval_freq": 0, "save_freq": 5_000, "keep_checkpoints": 1, "test_episodes": 1,
 }  # fmt: skip
 
 
@@ -49,6 +50,7 @@ def report_only(point: dict[str, Any]) -> None:
 
 def driver_alone(trials: int, folder: Path) -> float:
     """Seconds a trial that the driver needs, with two workers that are kept from trial to trial."""
+    os.environ.update(TUNE_DISABLE_AUTO_CALLBACK_LOGGERS="1", RAY_AIR_NEW_OUTPUT="0")
     import ray
     from ray import tune
 
@@ -71,6 +73,7 @@ def checkpoint_cost(run: Path, folder: Path) -> tuple[float, float]:
     """Megabytes of a whole run folder, and the seconds that Ray's copy of it takes."""
     import pyarrow.fs
 
+    (folder / "copy").mkdir()
     size = sum(path.stat().st_size for path in run.rglob("*")) / 1e6
     started = time.monotonic()
     pyarrow.fs.copy_files(str(run), str(folder / "copy"))
