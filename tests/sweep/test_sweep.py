@@ -18,7 +18,7 @@ pytest.importorskip("ray")
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="kills as POSIX does")
 
 SMALL = {**TINY, "test_episodes": 3}
-LONG = {**SMALL, "total_timesteps": 8_000, "save_freq": 800, "eval_freq": 4_000, "buffer_size": 2_000}
+LONG = {**SMALL, "total_timesteps": 6_000, "save_freq": 500, "eval_freq": 3_000, "buffer_size": 2_000}
 
 
 @pytest.fixture(autouse=True)
@@ -98,22 +98,20 @@ def test_a_grid_leaves_run_folders_a_table_and_a_ranking_and_survives_what_diver
     code, _, errors = Sweep(file, "--out", f"local://{out}").end()
     assert code == 2
     assert "it exists already; to go on with a sweep: sb3-flock sweep --resume" in errors
-    code, _, errors = Sweep("--resume", f"local://{out}").end()  # nothing is left to do
-    assert code == 0, errors
-    assert results(out) == rows
 
 
-def test_a_killed_driver_goes_on_to_the_same_policies(tmp_path):
-    file, out = sweep_file(tmp_path, f"base: {LONG}\ngrid: {{seed: [0, 1]}}\n"), tmp_path / "out"
+@pytest.mark.slow
+def test_a_killed_driver_goes_on_to_the_same_policy(tmp_path):
+    file, out = sweep_file(tmp_path, f"base: {LONG}\ngrid: {{seed: [5]}}\n"), tmp_path / "out"
     first = Sweep(file, "--out", out)
-    first.wait_for_checkpoints(out, 2)
-    time.sleep(1)
+    first.wait_for_checkpoints(out, 1)
+    time.sleep(0.5)
     first.process.send_signal(signal.SIGKILL)
     first.end()
     assert not (out / "results.csv").exists()
     code, _, errors = Sweep("--resume", out).end()
     assert code == 0, errors
-    assert [row["status"] for row in results(out)] == ["done", "done"]
+    assert [row["status"] for row in results(out)] == ["done"]
     assert_the_same_as_trained_alone(file, out, tmp_path)
 
 
@@ -137,6 +135,7 @@ def test_a_killed_node_s_trial_goes_on_on_the_other(tmp_path):
     assert_the_same_as_trained_alone(file, out, tmp_path)
 
 
+@pytest.mark.slow
 def test_an_interrupted_sweep_says_how_to_go_on(tmp_path):
     file, out = sweep_file(tmp_path, f"base: {LONG}\ngrid: {{seed: [0, 1, 2]}}\n"), tmp_path / "out"
     run = Sweep(file, "--out", out)
@@ -150,13 +149,13 @@ def test_an_interrupted_sweep_says_how_to_go_on(tmp_path):
 
 def test_a_search_ends_with_its_best(tmp_path):
     space = "{learning_rate: {low: 0.0001, high: 0.01, log: true}, batch_size: {low: 8, high: 32}, gamma: [0.9, 0.96]}"
-    file, out = sweep_file(tmp_path, f"base: {SMALL}\nsearch: {space}\ntrials: 3\n"), tmp_path / "out"
+    file, out = sweep_file(tmp_path, f"base: {SMALL}\nsearch: {space}\ntrials: 2\n"), tmp_path / "out"
     code, output, errors = Sweep(file, "--out", out).end()
     assert code == 0, errors
     rows = results(out)
-    assert len(rows) == 3
+    assert len(rows) == 2
     assert all(8 <= int(row["learner.batch_size"]) <= 32 for row in rows)
-    assert len({row["learner.learning_rate"] for row in rows}) == 3
+    assert len({row["learner.learning_rate"] for row in rows}) == 2
     assert "learning_rate" in output
 
 
