@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sb3_flock.settings import RunError, SettingsError, UserError
+from sb3_flock.settings import RunError, SettingsError, UserError, field_of
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -149,11 +149,7 @@ def _field_help(path: str) -> str:
     """A config field's own description and default."""
     from sb3_flock.rl.config import TrainingConfig
 
-    *groups, name = path.split(".")
-    settings: Any = TrainingConfig
-    for group in groups:
-        settings = settings.model_fields[group].annotation
-    field = settings.model_fields[name]
+    field = field_of(TrainingConfig, path)
     default = "" if field.default is None else f" [{field.default}]"
     return f"{field.description}{default}".replace("%", "%%")
 

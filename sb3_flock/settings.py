@@ -13,6 +13,7 @@ from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, TypeVar, get_origin
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic.fields import FieldInfo
 
 _Settings = TypeVar("_Settings", bound="Settings")
 
@@ -85,6 +86,15 @@ def leaf_paths(settings: type[Settings], prefix: tuple[str, ...] = ()) -> Iterab
             yield (*prefix, name)
         else:
             yield from leaf_paths(group, (*prefix, name))
+
+
+def field_of(settings: Any, path: str) -> FieldInfo:
+    """The field of a settings class that a whole path names, such as ``scenario.n_vehicles``."""
+    *groups, name = path.split(".")
+    for group in groups:
+        settings = settings.model_fields[group].annotation
+    field: FieldInfo = settings.model_fields[name]
+    return field
 
 
 def resolve_path(settings: type[Settings], key: str) -> tuple[str, ...]:

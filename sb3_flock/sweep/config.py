@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 from sb3_flock.evaluation.metrics import METRICS
 from sb3_flock.rl.config import TrainingConfig
 from sb3_flock.rl.config_io import load_config, read_yaml
-from sb3_flock.settings import Settings, SettingsError, resolve_path, shown
+from sb3_flock.settings import Settings, SettingsError, field_of, resolve_path, shown
 from sb3_flock.sim import Scenario
 
 MAX_TRIALS = 100_000
@@ -127,11 +127,7 @@ def fitting(key: str, value: float) -> float:
 
 def is_whole(key: str) -> bool:
     """Whether a field of the training config, named in full, holds whole numbers."""
-    settings: Any = TrainingConfig
-    *groups, name = key.split(".")
-    for group in groups:
-        settings = settings.model_fields[group].annotation
-    return bool(settings.model_fields[name].annotation is int)
+    return field_of(TrainingConfig, key).annotation is int
 
 
 def load_sweep(
@@ -145,8 +141,8 @@ def load_sweep(
     :raises SettingsError: one line for a file or a value that is not accepted
     """
     values = {**read_yaml(Path(path), text), **changes}
-    for name, field in SweepConfig.model_fields.items():  # a list or a scalar is told by name before it is taken apart
-        if name in ("grid", "search") and not isinstance(values.get(name, field.default), Mapping):
+    for name in ("grid", "search"):  # a list or a scalar is told by name before it is taken apart
+        if not isinstance(values.get(name, {}), Mapping):
             raise SettingsError(f"{name} = {shown(values[name])}: a mapping of fields to values is needed")
     shared = values.get("base") or {}
     if isinstance(shared, str):
@@ -160,7 +156,7 @@ def load_sweep(
         raise SettingsError(f"{idle[0]} does not tell on a flight, only the scenario's fields do")
     values["base"] = {**_named_in_full(_leaves(shared)), **added}
     for name in ("grid", "search"):
-        values[name] = _named_in_full((values.get(name) or {}).items())
+        values[name] = _named_in_full(values.get(name, {}).items())
     if isinstance(values.get("tasks"), list):
         values["tasks"] = [".".join(resolve_path(TrainingConfig, str(task))) for task in values["tasks"]]
     return SweepConfig(**values)

@@ -138,7 +138,6 @@ def load_shipped(policy: bytes) -> LoadedPolicy:
 
 
 def _tested(metrics: Mapping[str, Metric]) -> dict[str, Any]:
-    """The test's metrics as a report: the means, and their intervals."""
+    """The test's means as a report."""
     means = {name: np.nan if metric.mean is None else metric.mean for name, metric in metrics.items()}
-    spans = {name: (metric.low, metric.high) for name, metric in metrics.items()}
-    return {"test": {**means, "score": score(means)}, "intervals": spans}
+    return {"test": {**means, "score": score(means)}}
