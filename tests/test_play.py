@@ -152,10 +152,11 @@ def test_mistakes_are_one_line(monkeypatch, capsys):
 
 @pytest.fixture
 def screen(monkeypatch):
-    """An X server of its own."""
+    """An X server of its own, which does not start anew (and drop who is just connecting) as its last client leaves."""
     read, write = os.pipe()
     server = subprocess.Popen(
-        ["Xvfb", "-displayfd", str(write), "-screen", "0", "1000x800x24", "-nolisten", "tcp"], pass_fds=[write]
+        ["Xvfb", "-noreset", "-displayfd", str(write), "-screen", "0", "1000x800x24", "-nolisten", "tcp"],
+        pass_fds=[write],
     )
     os.close(write)
     with os.fdopen(read) as number:
@@ -188,6 +189,7 @@ def test_a_real_window_with_a_real_mouse_and_keys(screen, tmp_path):
         window, deadline = "", time.monotonic() + 60
         while not window:
             window = xdotool("search", "--onlyvisible", "--class", ".")
+            assert process.poll() is None
             assert time.monotonic() < deadline
         wait_for("4 vehicles, 1 obstacle")
         point_at(60, HEADER + 60)
