@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from rich.table import Table
 
 from sb3_flock.evaluation.figures import LINE_STYLES, new_figure
-from sb3_flock.evaluation.report import SHORT_COLUMNS, plain_table
+from sb3_flock.evaluation.report import SHORT_COLUMNS, add_short_columns, plain_table, short_cells
 from sb3_flock.rl.config import TrainingConfig
 from sb3_flock.rl.config_io import load_config
 from sb3_flock.settings import SettingsError, leaf_paths
@@ -85,11 +85,12 @@ def results_table(runs: Sequence[Run]) -> Table:
     """The best evaluation of each run, and when it was."""
     table = plain_table()
     table.add_column("run", overflow="fold")
-    for heading in ("best at", "of", "min", *(heading for heading, _ in SHORT_COLUMNS.values())):
+    for heading in ("best at", "of", "min"):
         table.add_column(heading, justify="right", no_wrap=True)
+    add_short_columns(table)
     for run in runs:
         curves, best = run.curves, run.best
-        values = [pattern.format(float(curves[metric][best])) for metric, (_, pattern) in SHORT_COLUMNS.items()]
+        values = short_cells({name: curve[best] for name, curve in curves.items()})
         when = f"{_thousands(curves['timesteps'][best])}", f"{_thousands(run.config.total_timesteps)}"
         table.add_row(run.name, *when, f"{float(curves['seconds'][-1]) / 60:.0f}", *values)
     return table

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich import box
 from rich.table import Table
 
@@ -62,6 +64,18 @@ SHORT_COLUMNS = {
 def plain_table() -> Table:
     """An empty table in the style of all of ours."""
     return Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+
+
+def add_short_columns(table: Table) -> None:
+    """Columns for :data:`SHORT_COLUMNS`."""
+    for heading, _ in SHORT_COLUMNS.values():
+        table.add_column(heading, justify="right", no_wrap=True)
+
+
+def short_cells(means: Mapping[str, float | None], missing: str = "-") -> list[str]:
+    """What stands in them: each metric's mean, or ``missing`` where there is none (``None``, NaN)."""
+    values = [(means.get(name), pattern) for name, (_, pattern) in SHORT_COLUMNS.items()]
+    return [missing if value is None or np.isnan(value) else pattern.format(value) for value, pattern in values]
 
 
 def metrics_table(metrics: dict[str, Metric], scenario: Scenario) -> Table:

@@ -8,7 +8,7 @@ from rich.table import Table
 
 from sb3_flock.evaluation.episodes import evaluate
 from sb3_flock.evaluation.metrics import Metric
-from sb3_flock.evaluation.report import SHORT_COLUMNS, plain_table
+from sb3_flock.evaluation.report import add_short_columns, plain_table, short_cells
 from sb3_flock.sim import Scenario
 from sb3_flock.sim.sensors import SensorErrors
 
@@ -33,16 +33,14 @@ def evaluate_with_errors(policy: Any, scenario: Scenario, episodes: int, seed: i
 
 def cells(row: dict[str, Metric]) -> list[str]:
     """One row's numbers as they are shown."""
-    values = [(row[name].mean, pattern) for name, (_, pattern) in SHORT_COLUMNS.items()]
-    return ["-" if value is None else pattern.format(value) for value, pattern in values]
+    return short_cells({name: metric.mean for name, metric in row.items()})
 
 
 def errors_table(rows: dict[str, dict[str, Metric]]) -> Table:
     """The metrics under each error, a line each."""
     table = plain_table()
     table.add_column("sensor errors", no_wrap=True)
-    for heading, _ in SHORT_COLUMNS.values():
-        table.add_column(heading, justify="right", no_wrap=True)
+    add_short_columns(table)
     for name, row in rows.items():
         table.add_row(name, *cells(row))
     return table

@@ -20,7 +20,7 @@ from rich.table import Table
 
 from sb3_flock.evaluation.figures import LINE_STYLES, new_figure, save_as
 from sb3_flock.evaluation.metrics import LARGER_IS_BETTER
-from sb3_flock.evaluation.report import SHORT_COLUMNS, plain_table
+from sb3_flock.evaluation.report import SHORT_COLUMNS, add_short_columns, plain_table, short_cells
 from sb3_flock.sweep.config import SweepConfig
 from sb3_flock.sweep.run import Folder, Trial, short
 from sb3_flock.sweep.trials import DONE
@@ -84,12 +84,9 @@ def trials_table(config: SweepConfig, trials: Sequence[Trial]) -> Table:
     table = plain_table()
     for key in keys:
         table.add_column(key.split(".")[-1], overflow="fold")
-    for heading, _ in SHORT_COLUMNS.values():
-        table.add_column(heading, justify="right", no_wrap=True)
+    add_short_columns(table)
     for trial in trials:
-        values = {name: trial.metrics.get(name, np.nan) for name in SHORT_COLUMNS}
-        cells = ["-" if np.isnan(value) else _pattern(name).format(value) for name, value in values.items()]
-        table.add_row(*(short(trial.point[key]) for key in keys), *cells)
+        table.add_row(*(short(trial.point[key]) for key in keys), *short_cells(trial.metrics))
     return table
 
 

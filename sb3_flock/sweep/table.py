@@ -12,7 +12,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from sb3_flock.evaluation.report import SHORT_COLUMNS, plain_table
+from sb3_flock.evaluation.report import SHORT_COLUMNS, add_short_columns, plain_table, short_cells
 
 _OTHER_COLUMNS = 54
 """Width of the table beside the trials' names."""
@@ -85,8 +85,9 @@ class TrialsTable(tune.Callback):
     def _table(self, trials: list[Any]) -> Table:
         table = plain_table()
         table.add_column("trial", no_wrap=True, overflow="ellipsis", max_width=max(12, self.console.width - _OTHER_COLUMNS))
-        for heading in ("state", "done", *(heading for heading, _ in SHORT_COLUMNS.values())):
+        for heading in ("state", "done"):
             table.add_column(heading, justify="right", no_wrap=True)
+        add_short_columns(table)
         running = [trial for trial in trials if trial.status == "RUNNING"]
         room = max(4, self.console.height - 6)
         running = running[:room]
@@ -113,5 +114,4 @@ def _share(trial: Any) -> str:
 def _cells(trial: Any) -> list[str]:
     """The test's metrics, or the last evaluation's."""
     report = trial.last_result or {}
-    report = {**report, **report.get("test", {})}
-    return [pattern.format(report[name]) if name in report else "" for name, (_, pattern) in SHORT_COLUMNS.items()]
+    return short_cells({**report, **report.get("test", {})}, missing="")
