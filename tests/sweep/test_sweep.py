@@ -18,7 +18,7 @@ pytest.importorskip("ray")
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="kills as POSIX does")
 
 SMALL = {**TINY, "test_episodes": 3}
-LONG = {**SMALL, "total_timesteps": 6_000, "save_freq": 500, "eval_freq": 3_000, "buffer_size": 2_000}
+LONG = {**SMALL, "total_timesteps": 4_000, "save_freq": 500, "eval_freq": 2_000, "buffer_size": 2_000}
 
 
 @pytest.fixture(autouse=True)
