@@ -7,13 +7,14 @@ that is compared with the discounted reward that the same policy then collects i
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 
 import numpy as np
 import torch as th
 
 from sb3_flock import load_policy
 from sb3_flock.evaluation.episodes import PolicyController
-from sb3_flock.evaluation.figures import new_figure
+from sb3_flock.evaluation.figures import new_figure, save_as
 from sb3_flock.rl.loading import LoadedPolicy
 from sb3_flock.sim import Scenario, World, episode_rng, observe, own_reward, reward_terms, sense
 
@@ -79,7 +80,7 @@ def main(name: str, picture: str | None = None) -> None:
         axes.set(xlabel="spacing [m] (line: practice's minimum)", ylabel="value [rewards]", title=f"three at rest, {name}")
         axes.grid(alpha=0.3)
         axes.legend()
-        figure.savefig(picture, dpi=120)
+        save_as(figure, Path(picture), Path(picture).suffix[1:])
 
 
 if __name__ == "__main__":

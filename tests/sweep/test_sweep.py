@@ -101,18 +101,22 @@ def test_a_grid_leaves_run_folders_a_table_and_a_ranking_and_survives_what_diver
 
 
 @pytest.mark.slow
-def test_a_killed_driver_goes_on_to_the_same_policy(tmp_path):
-    file, out = sweep_file(tmp_path, f"base: {LONG}\ngrid: {{seed: [5]}}\n"), tmp_path / "out"
+def test_a_killed_driver_goes_on_to_the_same_policies(tmp_path):
+    file, out = sweep_file(tmp_path, f"base: {LONG}\ngrid: {{seed: [0, 1]}}\n"), tmp_path / "out"
     first = Sweep(file, "--out", out)
-    first.wait_for_checkpoints(out, 1)
+    first.wait_for_checkpoints(out, 2)
     time.sleep(0.5)
     first.process.send_signal(signal.SIGKILL)
     first.end()
     assert not (out / "results.csv").exists()
     code, _, errors = Sweep("--resume", out).end()
     assert code == 0, errors
-    assert [row["status"] for row in results(out)] == ["done"]
+    assert [row["status"] for row in results(out)] == ["done", "done"]
     assert_the_same_as_trained_alone(file, out, tmp_path)
+    rows = results(out)
+    code, _, errors = Sweep("--resume", out).end()  # nothing is left to do
+    assert code == 0, errors
+    assert results(out) == rows
 
 
 def test_a_killed_node_s_trial_goes_on_on_the_other(tmp_path):
