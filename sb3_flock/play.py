@@ -190,6 +190,7 @@ class Game:
         n_vehicles, n_obstacles = (state[name].shape[1] for name in ("positions", "obstacle_positions"))
         self.world = World(self.scenario.replace(n_vehicles=n_vehicles, n_obstacles=n_obstacles))
         self.world.load_state_dict(state)
+        self.world.sensors.forget()
         self.sensing = sense(self.world)
         self._tell_controller()
 
@@ -201,7 +202,7 @@ class Game:
         """A waypoint that was dragged stays where it was left."""
         if self.held is not None:
             self.world.waypoints = self.held[None].copy()
-            self.sensing = sense(self.world)
+            self.sensing = sense(self.world, self.sensing.moved)
 
     @staticmethod
     def _is_in_picture(pixels: tuple[int, int]) -> bool:
@@ -210,11 +211,11 @@ class Game:
     # -- what one vehicle sees ---------------------------------------------------------------------------------------
 
     def _paint_channels(self, picture: pygame.Surface, top: int) -> None:
-        """The three channels of the watched vehicle, forward up and left to the left; and a ring around it."""
+        """What the watched vehicle sees at present, forward up and left to the left; and a ring around it."""
         assert self.watched is not None
         x, y = self.renderer.pixels_of(self.world.positions[0, self.watched])
         pygame.draw.circle(picture, "black", (x, y), 24, width=2)
-        channels = observe(self.sensing, self.world.scenario)[0, self.watched]
+        channels = observe(self.sensing, self.world.scenario)[0, self.watched, : len(_CHANNELS)]
         for channel, (values, name) in enumerate(zip(channels, _CHANNELS, strict=True)):
             grey = (255 * (1 - np.clip(values, 0, 1))).astype(np.uint8)
             # [forward, left] to pixels [x to the right, y downward]

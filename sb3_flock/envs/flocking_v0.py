@@ -4,7 +4,8 @@
 Import                    ``from sb3_flock import flocking_v0``; then ``pettingzoo.make("parallel", "flock/flocking-v0")``, too
 Agents                    ``vehicle_0`` ... ``vehicle_{n-1}``; all live through the whole episode
 Actions                   continuous, ``Box([0, -pi], [0.15, pi], (2,))``: speed v [m/s] and turn rate omega [rad/s]
-Observations              ``Box(0, 1e6, (3, 11, 11), float32)``: neighbors, obstacles, waypoint in the body frame
+Observations              ``Box(0, 1e6, (3, 11, 11), float32)``: neighbors, obstacles, waypoint in the body frame; with
+                          ``look_back`` three more channels, within ``[-1e6, 1e6]``: how the first three have changed
 Rewards                   r_i of section IV-B with our weights, without the neighbors' share, which training mixes in
 Termination, truncation   never terminated; all agents are truncated after ``max_cycles`` steps
 Rendering                 ``human`` (a window) and ``rgb_array``; both need pygame, the ``render`` extra
@@ -64,7 +65,9 @@ def raw_env(**kwargs: Any) -> AECEnv:
 
 def observation_space(scenario: Scenario) -> spaces.Box:
     """One vehicle's observation space; the same for any number of vehicles, so that a policy fits them all."""
-    return spaces.Box(0.0, float(MAX_BODIES), scenario.observation_shape, np.float32)
+    low = np.zeros(scenario.observation_shape, np.float32)
+    low[3:] = -MAX_BODIES
+    return spaces.Box(low, float(MAX_BODIES), dtype=np.float32)
 
 
 def action_space(scenario: Scenario) -> spaces.Box:
@@ -160,7 +163,7 @@ class parallel_env(ParallelEnv[str, Observation, Action]):  # noqa: N801 - Petti
         return self._renderer.draw(self.world)
 
     def state(self) -> NDArray[np.float32]:
-        """All vehicles' observations stacked, ``(vehicles, 3, l, l)``."""
+        """All vehicles' observations stacked, ``(vehicles, channels, l, l)``, without sensor errors and memory."""
         return observe(sense(self.world), self.scenario)[0]
 
     def state_dict(self) -> dict[str, Any]:
@@ -185,7 +188,10 @@ class parallel_env(ParallelEnv[str, Observation, Action]):  # noqa: N801 - Petti
             self._renderer = None
 
     def _observations(self, sensing: Sensing) -> dict[str, Observation]:
-        return dict(zip(self.possible_agents, observe(self.world.sensors.measure(sensing), self.scenario)[0], strict=True))
+        return dict(zip(self.possible_agents, observe(self._measure(sensing), self.scenario)[0], strict=True))
+
+    def _measure(self, sensing: Sensing) -> Sensing:
+        return self.world.sensors.measure(sensing)
 
     def _infos(self, sensing: Sensing, terms: dict[str, NDArray[np.float64]], truncated: bool) -> dict[str, dict[str, Any]]:
         scenario = self.scenario

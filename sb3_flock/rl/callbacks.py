@@ -89,6 +89,17 @@ class NeighborInclusiveReward(BaseCallback):
         return mix_rewards(rewards, observers, first + np.concatenate(neighbors), self.lambda_)
 
 
+class DemonstratedActions(BaseCallback):
+    """Stores the actions that were flown where a teacher flew: those in the infos of a
+    :class:`~sb3_flock.envs.demonstrations.DemonstratedEnv`, in place of those the policy gave."""
+
+    def _on_step(self) -> bool:
+        for slot, info in enumerate(self.locals["infos"]):
+            if "action" in info:
+                self.locals["buffer_actions"][slot] = self.model.policy.scale_action(info["action"])
+        return True
+
+
 class FlockMetrics(BaseCallback):
     """Logs the infos' ``metrics`` and ``reward_terms`` as ``flock/...``: means since an episode last ended."""
 

@@ -17,7 +17,9 @@ Count = Annotated[int, Field(ge=0, le=10**12)]
 class NetworkConfig(Settings):
     """The networks' shapes (paper, IV-C)."""
 
-    channels: tuple[Width, Width] = Field((16, 32), description="output channels of the two convolutions (open)")
+    channels: tuple[Width, ...] = Field(
+        (16, 32), min_length=1, max_length=16, description="output channels of the convolutions, two in the paper (open)"
+    )
     kernel_size: int = Field(3, ge=1, le=15, description="side of the convolutions' kernels [anchors] (open)")
     stride: int = Field(2, ge=1, le=101, description="stride of the convolutions [anchors] (open)")
     features_dim: Width = Field(128, description="width of the dense layer behind the convolutions (open)")
@@ -86,6 +88,14 @@ class PracticeConfig(Settings):
     )
     separation_ratio: float = Field(
         1.06, ge=1, le=1e6, description="minimum separations, relative to the task's (ours; paper: 1)"
+    )
+
+    teacher: Literal["orca", "olfati-saber"] | None = Field(
+        None, description="controller that flies some of the episodes for the policy to learn from; null: none (ours)"
+    )
+    teacher_share: float = Field(0.25, ge=0, le=1, description="share of the episodes that the teacher flies (ours)")
+    teacher_noise: NotNegative = Field(
+        0.1, description="standard deviation of the noise on the teacher's actions [half the action range] (ours)"
     )
 
 

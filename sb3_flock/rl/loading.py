@@ -70,11 +70,15 @@ class LoadedPolicy:
 
         :raises PolicyError: if its tensor has another shape
         """
+        if bool(scenario.look_back) != bool(self.scenario.look_back):
+            raise PolicyError(
+                f"{self.path}: it flies with look_back = {self.scenario.look_back}, but the scenario has {scenario.look_back}"
+            )
         if scenario.n_anchors != self.scenario.n_anchors:
             raise PolicyError(
                 f"{self.path}: it sees {self.scenario.n_anchors} anchors a side, but the scenario has {scenario.n_anchors}"
             )
-        names = ("link_range", "detection_range", "channel_radii", "anchor_width", "max_speed", "max_turn_rate")
+        names = ("link_range", "detection_range", "channel_radii", "anchor_width", "look_back", "max_speed", "max_turn_rate")
         values = [(name, getattr(self.scenario, name), getattr(scenario, name)) for name in names]
         changed = [f"{name} = {trained}, flown with {flown}" for name, trained, flown in values if trained != flown]
         if changed:
@@ -83,7 +87,7 @@ class LoadedPolicy:
     def predict(
         self, observation: np.ndarray, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> tuple[np.ndarray, Any]:
-        """SB3's ``predict``: tensors ``(vehicles, 3, l, l)`` (or one) to actions ``(vehicles, 2)`` [m/s, rad/s]."""
+        """SB3's ``predict``: tensors ``(vehicles, channels, l, l)`` (or one) to actions ``(vehicles, 2)`` [m/s, rad/s]."""
         return self.policy.predict(observation, state, episode_start, deterministic)
 
 
@@ -286,7 +290,9 @@ def _describe_plain_file(archive: zipfile.ZipFile) -> dict[str, Any]:
         low, high = (_numbers(data["action_space"][name]) for name in ("low", "high"))
         if low != [0.0, -high[1]]:
             raise ValueError("its actions are not a speed and a turn rate")
-        _, n_anchors, _ = data["observation_space"]["_shape"]
+        channels, n_anchors, _ = data["observation_space"]["_shape"]
+        if channels != 3:
+            raise ValueError(f"its tensor has {channels} channels, and nothing tells how long it looks back")
         ours = data["policy_class"]["__module__"] == FlockPolicy.__module__
         kwargs = data["policy_kwargs"]
         config = {

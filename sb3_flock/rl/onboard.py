@@ -22,8 +22,9 @@ from torch import nn
 from sb3_flock.rl.loading import LoadedPolicy
 from sb3_flock.rl.saving import versions, write_whole
 from sb3_flock.settings import RunError, SettingsError
-from sb3_flock.sim import Scenario, World, episode_rng, observe
+from sb3_flock.sim import Scenario, World, episode_rng, observe, sense
 from sb3_flock.sim.sensing import find_contacts
+from sb3_flock.sim.sensors import SensorErrors
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -31,11 +32,13 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 INPUTS = ("neighbors", "obstacles", "waypoint")
+EARLIER_INPUTS = ("neighbors_before", "obstacles_before", "waypoint_before", "moved")
+"""Further inputs for a policy with a second look."""
 TOLERANCE = 1e-5
 """Largest difference to ``predict`` that an exported policy may have, as a share of the action's range; it is float32's."""
 
-Situation = tuple["NDArray[np.float64]", "NDArray[np.float64]", "NDArray[np.float64]"]
-"""The three inputs of the graph."""
+Situation = dict[str, "NDArray[np.float64]"]
+"""The inputs of the graph by name."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +53,9 @@ class Export:
     """Median time of a decision on one core [s]."""
 
 
+_NOTHING = th.empty(0)
+
+
 class Onboard(nn.Module):
     """The vehicle's side of a policy: the tensor of section IV-A, the actor, and physical units.
 
@@ -57,6 +63,10 @@ class Onboard(nn.Module):
     number, 2)`` and of the waypoint ``(2,)``, all in the body frame [m] (forward is +x, left is +y) and float64, as NumPy has
     it; what is out of its range is left out as in :func:`~sb3_flock.sim.sense`. It gives ``(2,)``: speed [m/s] and turn rate
     [rad/s].
+
+    With a second look it also takes what was measured ``look_back`` ago, ``neighbors_before``, ``obstacles_before`` and
+    ``waypoint_before`` in the body frame of then, and ``moved`` ``(3,)``: where the vehicle is now in that frame [m, m] and how
+    far it has turned since [rad]. Until it has flown that long: what was measured first.
 
     It counts in float64 throughout: where a policy turns about, float32 is off by 1e-5 rad/s, and the time goes elsewhere.
 
@@ -82,18 +92,40 @@ class Onboard(nn.Module):
         self.register_buffer("low", th.tensor(policy.action_space.low, dtype=th.float64))
         self.register_buffer("high", th.tensor(policy.action_space.high, dtype=th.float64))
 
-    def forward(self, neighbors: th.Tensor, obstacles: th.Tensor, waypoint: th.Tensor) -> th.Tensor:
+    def forward(
+        self,
+        neighbors: th.Tensor,
+        obstacles: th.Tensor,
+        waypoint: th.Tensor,
+        neighbors_before: th.Tensor = _NOTHING,
+        obstacles_before: th.Tensor = _NOTHING,
+        waypoint_before: th.Tensor = _NOTHING,
+        moved: th.Tensor | None = None,
+    ) -> th.Tensor:
         """The deterministic action, ``(2,)``."""
-        on_circle = waypoint / (_norm(waypoint) / self.scenario.goal_radius).clamp(min=1.0)
-        tensor = self._tensor(neighbors, obstacles, on_circle[None])
-        action = self.actor(tensor[None])[0]
+        bodies = [neighbors, obstacles, waypoint[None]]
+        seen = self._in_range(bodies)
+        if moved is not None:
+            before = [neighbors_before, obstacles_before, waypoint_before[None]]
+            seen += self._in_range(before)
+            cos, sin = moved[2].cos(), moved[2].sin()
+            frame = th.stack((th.stack((cos, -sin)), th.stack((sin, cos))))  # of now, as seen from the frame of then
+            bodies += [(positions - moved[:2]) @ frame for positions in before]
+        action = self.actor(self._tensor(bodies, seen)[None])[0]
         return self.low + (action + 1) / 2 * (self.high - self.low)
 
-    def _tensor(self, *bodies: th.Tensor) -> th.Tensor:
-        """All three channels at once, for speed: bodies marked by their channel's number, lengths in units of its sigma."""
-        scenario, side = self.scenario, self.scenario.n_anchors
-        radii = th.tensor(scenario.channel_radii, dtype=th.float64)
-        reach = th.tensor([scenario.link_range, scenario.detection_range, 2 * scenario.goal_radius], dtype=th.float64)
+    def _in_range(self, bodies: list[th.Tensor]) -> list[th.Tensor]:
+        ranges = (self.scenario.link_range, self.scenario.detection_range, float("inf"))
+        return [_norm(positions) < reach for positions, reach in zip(bodies, ranges, strict=True)]
+
+    def _tensor(self, bodies: list[th.Tensor], seen: list[th.Tensor]) -> th.Tensor:
+        """All channels at once, for speed: bodies marked by their channel's number, lengths in units of its sigma."""
+        scenario, side, channels = self.scenario, self.scenario.n_anchors, len(bodies)
+        bodies = [
+            positions / (_norm(positions) / scenario.goal_radius).clamp(min=1.0)[:, None] if number % 3 == 2 else positions
+            for number, positions in enumerate(bodies)
+        ]
+        radii = th.tensor(scenario.channel_radii * (channels // 3), dtype=th.float64)
         anchors = th.linspace(-1, 1, side, dtype=th.float64) * (side - 1) / (2 * scenario.anchor_width)
         marked = th.cat(
             [nn.functional.pad(positions, (0, 1), value=float(number)) for number, positions in enumerate(bodies)]
@@ -102,8 +134,9 @@ class Onboard(nn.Module):
         sigma = scenario.anchor_width * 2 * radii / (side - 1)
         factors = th.exp(-0.5 * ((positions / sigma[channel, None])[:, :, None] - anchors).square())
         spots = (factors[:, 0, :, None] * factors[:, 1, None, :]).flatten(1)
-        counts = (channel == th.arange(3)[:, None]) & (_norm(positions) < reach[channel])
-        return (counts.double() @ spots).view(3, side, side)
+        counts = (channel == th.arange(channels)[:, None]) & th.cat(seen)
+        tensor = (counts.double() @ spots).view(channels, side, side)
+        return tensor if channels == 3 else th.cat((tensor[:3], tensor[:3] - tensor[3:]))
 
 
 def _norm(vectors: th.Tensor) -> th.Tensor:
@@ -113,7 +146,8 @@ def _norm(vectors: th.Tensor) -> th.Tensor:
 def export(policy: LoadedPolicy, path: str | Path, situations: int = 1000, seed: int = 0) -> Export:
     """Write a policy as ONNX, if it decides there as it does here.
 
-    The graph is that of :class:`Onboard`, its inputs are :data:`INPUTS`, its output is ``action``. What else a vehicle needs to
+    The graph is that of :class:`Onboard`, its inputs are :data:`INPUTS`, with a second look :data:`EARLIER_INPUTS` as well, its
+    output is ``action``. What else a vehicle needs to
     know (ranges, sampling period, units) is in the file's metadata under ``sb3_flock``, as JSON.
 
     :param path: the file, which is written whole or not at all
@@ -134,14 +168,16 @@ def export(policy: LoadedPolicy, path: str | Path, situations: int = 1000, seed:
         raise SettingsError(f"export needs {error.name}: pip install 'sb3_flock[onnx]'") from None
     scenario = policy.scenario
     module = Onboard(policy.policy, scenario).eval()
+    inputs = inputs_of(scenario)
     any_number = {0: th.export.Dim.DYNAMIC}
+    shapes = {"waypoint": (2,), "waypoint_before": (2,), "moved": (3,)}
     with _quiet_exporter(), th.no_grad():
         program = th.onnx.export(
             module,
-            tuple(th.zeros(*shape, dtype=th.float64) for shape in ((3, 2), (2, 2), (2,))),
-            input_names=INPUTS,
+            tuple(th.zeros(*shapes.get(name, (2 + number, 2)), dtype=th.float64) for number, name in enumerate(inputs)),
+            input_names=inputs,
             output_names=["action"],
-            dynamic_shapes=(any_number, any_number, None),
+            dynamic_shapes=tuple(None if name in shapes else any_number for name in inputs),
             dynamo=True,
             verbose=False,
         )
@@ -162,15 +198,23 @@ def export(policy: LoadedPolicy, path: str | Path, situations: int = 1000, seed:
     return Export(path, situations, difference, latency)
 
 
+def inputs_of(scenario: Scenario) -> tuple[str, ...]:
+    """Names of the inputs of a policy's graph, in their order."""
+    return (*INPUTS, *EARLIER_INPUTS) if scenario.look_back else INPUTS
+
+
 def _metadata(policy: LoadedPolicy) -> dict[str, Any]:
     scenario = policy.scenario
     names = ("link_range", "detection_range", "neighbor_separation", "obstacle_separation", "time_step", "max_speed")
+    inputs = "positions in the body frame [m], forward +x, left +y: neighbors (any, 2), obstacles (any, 2), waypoint (2,)"
+    if scenario.look_back:
+        inputs += "; ..._before: those of look_back [s] ago, in the frame of then; moved (3,): own place in it, turn [rad]"
     return {
         **policy.describe(),
         "policy": policy.path.name,
-        "inputs": "positions in the body frame [m], forward +x, left +y: neighbors (any, 2), obstacles (any, 2), waypoint (2,)",
+        "inputs": inputs,
         "output": "action (2,): speed [m/s], turn rate [rad/s]",
-        **{name: getattr(scenario, name) for name in (*names, "max_turn_rate")},
+        **{name: getattr(scenario, name) for name in (*names, "max_turn_rate", "look_back")},
         "exported_with": versions(),
     }
 
@@ -182,7 +226,7 @@ def _compare(session: Any, policy: LoadedPolicy, count: int, seed: int) -> tuple
     actions, times = [], []
     for situation, _ in situations:
         start = time.perf_counter()
-        (action,) = session.run(None, dict(zip(INPUTS, situation, strict=True)))
+        (action,) = session.run(None, situation)
         times.append(time.perf_counter() - start)
         actions.append(action)
     expected = np.stack([policy.predict(tensor, deterministic=True)[0] for _, tensor in situations])
@@ -191,21 +235,40 @@ def _compare(session: Any, policy: LoadedPolicy, count: int, seed: int) -> tuple
 
 
 def random_situations(scenario: Scenario, count: int, seed: int) -> Iterator[tuple[Situation, NDArray[np.float32]]]:
-    """What one vehicle measures at the start of episodes of all sizes, in range or not, and the tensor it sees there."""
+    """What one vehicle measures early in episodes of all sizes, in range or not, and the tensor it sees there.
+
+    Without a second look that is the start, with one as many random steps behind it as it looks back.
+    """
     for number in range(count):
         rng = episode_rng(seed, number)
-        bodies = {"n_vehicles": int(rng.integers(1, 13)), "n_obstacles": int(rng.integers(0, 6)), "obstacle_motion": "walk"}
+        n_vehicles, n_obstacles = int(rng.integers(1, 13)), int(rng.integers(0, 6))
+        bodies = {"n_vehicles": n_vehicles, "n_obstacles": n_obstacles, "obstacle_motion": "walk"}
         arena = max(scenario.link_range, scenario.detection_range) * rng.uniform(2, 5)
-        world = World(scenario.replace(**bodies, arena=arena, obstacle_arena=arena))
-        sensing = world.reset([rng])
-        neighbors, obstacles = (
-            found.positions[found.observers == 0]
-            for found in (
-                find_contacts(world.positions, world.frames, world.positions, np.inf, others=True),
-                find_contacts(world.positions, world.frames, world.obstacle_positions, np.inf),
-            )
+        world = World(scenario.replace(**bodies, arena=arena, obstacle_arena=arena, sensors=SensorErrors()))
+        sensing = world.sensors.measure(world.reset([rng]))
+        situation = _measured_by_first(world)
+        if scenario.look_back:
+            before = {f"{name}_before": positions for name, positions in situation.items()}
+            (x, y), (cos, sin), heading = world.positions[0, 0], world.frames[0, 0], world.headings[0, 0]
+            for _ in range(scenario.look_back_steps):
+                actions = rng.uniform(world.action_low, world.action_high, (1, n_vehicles, 2))
+                sensing = world.sensors.measure(world.step(actions)[0])
+            dx, dy = world.positions[0, 0] - (x, y)
+            moved = np.array([cos * dx + sin * dy, cos * dy - sin * dx, world.headings[0, 0] - heading])
+            situation = {**_measured_by_first(world), **before, "moved": moved}
+        yield situation, observe(sensing, world.scenario)[0, 0]
+
+
+def _measured_by_first(world: World) -> Situation:
+    """Positions of all bodies in the first vehicle's frame."""
+    neighbors, obstacles = (
+        found.positions[found.observers == 0]
+        for found in (
+            find_contacts(world.positions, world.frames, world.positions, np.inf, others=True),
+            find_contacts(world.positions, world.frames, world.obstacle_positions, np.inf),
         )
-        yield (neighbors, obstacles, sensing.waypoint_positions[0, 0]), observe(sensing, world.scenario)[0, 0]
+    )
+    return {"neighbors": neighbors, "obstacles": obstacles, "waypoint": sense(world).waypoint_positions[0, 0]}
 
 
 @contextlib.contextmanager

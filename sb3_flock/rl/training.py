@@ -15,9 +15,11 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
-from sb3_flock.envs.vec_env import make_vec_env
+from sb3_flock.envs.demonstrations import DemonstratedEnv
+from sb3_flock.envs.vec_env import ParameterSharingVecEnv, flatten, make_vec_env
+from sb3_flock.evaluation.controllers import make_controller
 from sb3_flock.rl.algorithms import build_model
-from sb3_flock.rl.callbacks import FadingNoise, FlockMetrics, NeighborInclusiveReward
+from sb3_flock.rl.callbacks import DemonstratedActions, FadingNoise, FlockMetrics, NeighborInclusiveReward
 from sb3_flock.rl.checkpoints import LoadedCheckpoint, Stateful, inexactness, newest_checkpoint
 from sb3_flock.rl.config import TrainingConfig
 from sb3_flock.rl.config_io import load_config
@@ -154,12 +156,22 @@ def _prepare(config: TrainingConfig) -> tuple[OffPolicyAlgorithm, VecEnv]:
     flown = config.flown_scenario()
     for scenario in (config.scenario, flown):  # too crowded to start? Better told before the run folder is made
         World(scenario).reset([episode_rng(config.seed, 0)])
-    env = VecMonitor(make_vec_env(flown, config.n_flocks, config.num_cpus, seed=config.seed))
+    env = VecMonitor(_flocks(config))
     try:
         return _build(config, env), env
     except BaseException:
         env.close()
         raise
+
+
+def _flocks(config: TrainingConfig) -> ParameterSharingVecEnv:
+    """The flocks flown in training, with a teacher where ``practice`` names one."""
+    practice, flown = config.practice, config.flown_scenario()
+    if practice.teacher is None:
+        return make_vec_env(flown, config.n_flocks, config.num_cpus, seed=config.seed)
+    teacher: Any = make_controller(practice.teacher)
+    env = DemonstratedEnv(flown, teacher, practice.teacher_share, practice.teacher_noise)
+    return flatten(env, config.n_flocks, config.num_cpus, config.seed)
 
 
 def _run(
@@ -180,6 +192,7 @@ def _run(
     stateful: dict[str, Stateful] = {"rewards": rewards, "metrics": metrics, "evaluation": evaluation}
     parts: list[BaseCallback] = [
         rewards,
+        DemonstratedActions(),
         metrics,
         evaluation,
         FiniteLosses(),

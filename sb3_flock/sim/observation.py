@@ -1,4 +1,4 @@
-"""The three-channel, image-like tensor each vehicle sees (section IV-A)."""
+"""The image-like tensor each vehicle sees: three channels (section IV-A), and three more with a second look (ours)."""
 
 from __future__ import annotations
 
@@ -23,11 +23,23 @@ def observe(sensing: Sensing, scenario: Scenario, compile_it: bool = True) -> ND
     exp(-|d|^2 / (2 sigma^2)) over the bodies within sensing range; sigma is ``anchor_width`` anchor spacings. A waypoint
     beyond ``goal_radius`` shows on the circle of that radius, so that its bearing is always visible.
 
+    With ``look_back`` three more channels tell how the first three have changed: from what was sensed that long ago, in the
+    body's frame of now, to the present. What stands still over ground is 0 there, whatever the vehicle does.
+
     :param compile_it: use numba where it is installed; the numbers are the same to rounding
-    :return: ``(flocks, vehicles, 3, l, l)``, a fresh array
+    :return: ``(flocks, vehicles, 3 or 6, l, l)``, a fresh array
     """
     shape = sensing.waypoint_distances.shape
     tensor = np.empty((shape[0] * shape[1], *scenario.observation_shape), dtype=np.float32)
+    _paint_look(tensor, 0, sensing, scenario, compile_it)
+    if scenario.look_back:
+        _paint_look(tensor, 3, sensing.earlier or sensing, scenario, compile_it)
+        np.subtract(tensor[:, :3], tensor[:, 3:], out=tensor[:, 3:])
+    return tensor.reshape(*shape, *scenario.observation_shape)
+
+
+def _paint_look(tensor: NDArray[np.float32], first: int, sensing: Sensing, scenario: Scenario, compile_it: bool) -> None:
+    """Fill three channels with what is sensed."""
     reach = np.maximum(sensing.waypoint_distances / scenario.goal_radius, 1.0)
     waypoints = (sensing.waypoint_positions / reach[..., None]).reshape(-1, 2)
     bodies = (
@@ -37,13 +49,12 @@ def observe(sensing: Sensing, scenario: Scenario, compile_it: bool = True) -> ND
     )
     # From the first anchor to the last, the compiled Gaussians must not underflow on their way.
     kernels = compiled() if compile_it and scenario.n_anchors - 1 <= 30 * scenario.anchor_width else None
-    for channel, ((observers, positions), radius) in enumerate(zip(bodies, scenario.channel_radii, strict=True)):
+    for channel, ((observers, positions), radius) in enumerate(zip(bodies, scenario.channel_radii, strict=True), first):
         sigma = scenario.anchor_width * 2 * radius / (scenario.n_anchors - 1)
         if kernels is None:
             paint(tensor, channel, observers, positions, radius, sigma)
         else:
             kernels.paint(tensor, channel, observers, positions, radius, sigma, (0,) * scenario.n_anchors)
-    return tensor.reshape(*shape, *scenario.observation_shape)
 
 
 def paint(

@@ -78,6 +78,12 @@ class Scenario(Settings):
         1.0, ge=0.1, le=1e6, description="standard deviation sigma of the anchors' Gaussian [anchor spacings] (open)"
     )
 
+    look_back: NotNegative = Field(
+        0.0,
+        le=1e3,
+        description="age of a second look, whose difference from the present one adds three channels [s]; 0: none (paper, IV-A)",
+    )
+
     sensors: SensorErrors = Field(default_factory=SensorErrors, description="errors of what vehicles measure (paper: none)")
     reward: RewardWeights = Field(default_factory=RewardWeights, description="weights of the reward (paper, IV-B)")
 
@@ -111,6 +117,11 @@ class Scenario(Settings):
         )
 
     @property
+    def look_back_steps(self) -> int:
+        """Age of the second look, to the nearest step and at least one [steps]; 0 where there is none."""
+        return max(1, round(self.look_back / self.time_step)) if self.look_back else 0
+
+    @property
     def bodies(self) -> str:
         """How many fly and walk, in words: ``5 vehicles, 2 obstacles``."""
         counts = ((self.n_vehicles, "vehicle"), (self.n_obstacles, "obstacle"))
@@ -118,5 +129,5 @@ class Scenario(Settings):
 
     @property
     def observation_shape(self) -> tuple[int, int, int]:
-        """Shape of one vehicle's tensor, ``(3, l, l)``."""
-        return (3, self.n_anchors, self.n_anchors)
+        """Shape of one vehicle's tensor: ``(3, l, l)``, or ``(6, l, l)`` with a second look."""
+        return (6 if self.look_back else 3, self.n_anchors, self.n_anchors)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -54,6 +54,11 @@ class Contacts:
         """The bodies that each vehicle senses, ascending; one array a vehicle."""
         return np.split(self.bodies, np.cumsum(self.count().ravel())[:-1])
 
+    def after(self, moved: NDArray[np.float64]) -> Contacts:
+        """The same contacts in the observers' frames after a further move ``(contacts, 2)``."""
+        positions = after(self.positions, moved)
+        return replace(self, positions=positions, distances=_norm(positions))
+
     @property
     def vehicles(self) -> NDArray[np.int64]:
         """``bodies`` numbered like ``observers``, where they are vehicles."""
@@ -77,10 +82,31 @@ class Sensing:
     """``(flocks, vehicles, 2)``."""
     waypoint_distances: NDArray[np.float64]
     """``(flocks, vehicles)``."""
+    moved: NDArray[np.float64]
+    """``(flocks, vehicles, 2)``: own way forward [m] and, at its end, turn [rad] since the last step; 0 at the start."""
+    earlier: Sensing | None = None
+    """What was sensed ``look_back`` ago, seen from the place of now; ``None`` where vehicles do not remember."""
+
+    def after(self, moved: NDArray[np.float64]) -> Sensing:
+        """The same bodies, where they were, in the vehicles' frames after a further move."""
+        neighbors, obstacles = (
+            contacts.after(moved.reshape(-1, 2)[contacts.observers]) for contacts in (self.neighbors, self.obstacles)
+        )
+        waypoints = after(self.waypoint_positions, moved)
+        return replace(
+            self,
+            neighbors=neighbors,
+            obstacles=obstacles,
+            waypoint_positions=waypoints,
+            waypoint_distances=_norm(waypoints),
+        )
 
 
-def sense(world: World) -> Sensing:
-    """Everything the vehicles of every flock sense in the world's present state (section III-A)."""
+def sense(world: World, moved: NDArray[np.float64] | None = None) -> Sensing:
+    """Everything the vehicles of every flock sense in the world's present state (section III-A).
+
+    :param moved: :attr:`Sensing.moved`; ``None`` at the start
+    """
     scenario, positions = world.scenario, world.positions
     frames = world.frames
     offsets = world.waypoints[:, None, :] - positions
@@ -89,7 +115,15 @@ def sense(world: World) -> Sensing:
         obstacles=find_contacts(positions, frames, world.obstacle_positions, scenario.detection_range),
         waypoint_positions=_to_body(offsets, frames),
         waypoint_distances=_norm(offsets),
+        moved=np.zeros_like(positions) if moved is None else moved,
     )
+
+
+def after(positions: NDArray[np.float64], moved: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Positions in a body's frame ``(..., 2)`` [m] as they are in its frame after the body moved (:attr:`Sensing.moved`)."""
+    forward, turn = moved[..., 0], moved[..., 1]
+    ahead = np.stack((positions[..., 0] - forward, positions[..., 1]), axis=-1)
+    return _to_body(ahead, np.stack((np.cos(turn), np.sin(turn)), axis=-1))
 
 
 def find_contacts(

@@ -75,7 +75,7 @@ class World:
     def __init__(self, scenario: Scenario, n_flocks: int = 1) -> None:
         self.scenario = scenario
         self.n_flocks = n_flocks
-        self.sensors = Sensors(scenario.sensors, scenario.time_step)
+        self.sensors = Sensors(scenario)
         self.action_low = np.array([0.0, -scenario.max_turn_rate])
         self.action_high = np.array([scenario.max_speed, scenario.max_turn_rate])
         # As large as the actions: NumPy is slow where it repeats a bound along a last axis this short.
@@ -142,7 +142,7 @@ class World:
         self._move_obstacles(dt)
         self.steps += 1
         self._move_waypoints(scenario.waypoint_speed * dt)
-        return sense(self), clipped
+        return sense(self, clipped * dt), clipped
 
     def state_dict(self) -> dict[str, Any]:
         """The episode under way: all that its next steps depend on besides the actions."""

@@ -20,7 +20,13 @@ with warnings.catch_warnings():  # importing PettingZoo's tests imports its depr
         seed_test,
     )
 
-VARIANTS = [{}, {"n_vehicles": 5, "n_obstacles": 2}, {"n_vehicles": 1, "n_obstacles": 0}, {"n_vehicles": 2, "max_cycles": 7}]
+VARIANTS = [
+    {},
+    {"n_vehicles": 5, "n_obstacles": 2},
+    {"n_vehicles": 1, "n_obstacles": 0},
+    {"n_vehicles": 2, "max_cycles": 7},
+    {"look_back": 0.2},
+]
 
 
 def fly(env, seed, episodes, action_seed=0):

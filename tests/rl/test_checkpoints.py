@@ -62,7 +62,15 @@ LONG = {"scenario.max_cycles": 40, "save_freq": 120, "eval_freq": 180, "total_ti
 
 @pytest.mark.parametrize(
     ("algo", "changes"),
-    [("ddpg", {}), ("ddpg-stock", {}), ("td3", {"n_steps": 3}), ("sac", {}), ("ddpg", {"buffer_size": 10_000})],
+    [
+        ("ddpg", {}),
+        ("ddpg-stock", {}),
+        ("td3", {"n_steps": 3}),
+        ("sac", {}),
+        ("ddpg", {"buffer_size": 10_000}),
+        ("ddpg", {"look_back": 0.3, "teacher": "orca", "teacher_share": 0.5}),
+        ("ddpg", {"teacher": "olfati-saber", "teacher_share": 0.9}),
+    ],
 )
 def test_a_resumed_run_ends_like_one_never_interrupted_to_the_last_bit(tmp_path, algo, changes):
     one = train(tiny(tmp_path / "a", algo=algo, **{**LONG, **changes}), quiet())

@@ -8,7 +8,7 @@ import torch as th
 from sb3_flock import load_policy, train
 from sb3_flock.cli import main
 from sb3_flock.rl import onboard
-from sb3_flock.rl.onboard import INPUTS, TOLERANCE, Onboard, export, random_situations
+from sb3_flock.rl.onboard import EARLIER_INPUTS, INPUTS, TOLERANCE, Onboard, export, random_situations
 from sb3_flock.settings import RunError, SettingsError
 from tests.rl.test_training import quiet, tiny
 
@@ -34,15 +34,15 @@ def test_it_decides_as_predict_does(exported, policy):
     session = onnxruntime.InferenceSession(exported.path)
     high = np.array([0.15, np.pi])
     for situation, tensor in random_situations(policy.scenario, 200, seed=7):
-        (action,) = session.run(None, dict(zip(INPUTS, situation, strict=True)))
+        (action,) = session.run(None, situation)
         np.testing.assert_allclose(action / high, policy.predict(tensor)[0] / high, atol=1e-5)
 
 
 def test_situations_are_of_all_kinds(policy):
     situations = [situation for situation, _ in random_situations(policy.scenario, 200, seed=0)]
-    assert {len(neighbors) for neighbors, _, _ in situations} == set(range(12))
-    assert {len(obstacles) for _, obstacles, _ in situations} == set(range(6))
-    nearest = [np.linalg.norm(neighbors, axis=-1).min(initial=9) for neighbors, _, _ in situations]
+    assert {len(situation["neighbors"]) for situation in situations} == set(range(12))
+    assert {len(situation["obstacles"]) for situation in situations} == set(range(6))
+    nearest = [np.linalg.norm(situation["neighbors"], axis=-1).min(initial=9) for situation in situations]
     assert min(nearest) < policy.scenario.link_range < max(nearest)
 
 
@@ -67,12 +67,32 @@ def test_the_file_tells_what_a_vehicle_needs(exported):
 
 
 @pytest.mark.parametrize(
-    "changes", [{"algo": "sac"}, {"algo": "td3", "network.action_bound": "tanh", "scenario.n_anchors": 15}]
+    "changes",
+    [{"algo": "sac"}, {"algo": "td3", "network.action_bound": "tanh", "scenario.n_anchors": 15}, {"look_back": 0.2}],
 )
-def test_other_algorithms_and_networks(tmp_path, changes):
+def test_other_algorithms_networks_and_tensors(tmp_path, changes):
     result = train(tiny(tmp_path, **changes), quiet())
-    done = export(load_policy(result.folder / "final_model.zip"), tmp_path / "other.onnx", situations=20)
+    done = export(load_policy(result.folder / "final_model.zip"), tmp_path / "other.onnx", situations=50)
     assert done.difference < TOLERANCE
+
+
+def test_a_second_look_counts_aboard(tmp_path):
+    result = train(tiny(tmp_path, look_back=0.2), quiet())
+    path = tmp_path / "policy.onnx"
+    export(load_policy(result.folder / "final_model.zip"), path, situations=5)
+    session = onnxruntime.InferenceSession(path)
+    assert [part.name for part in session.get_inputs()] == [*INPUTS, *EARLIER_INPUTS]
+    told = json.loads(session.get_modelmeta().custom_metadata_map["sb3_flock"])
+    assert told["look_back"] == 0.2
+    assert "..._before" in told["inputs"]
+    near, waypoint = np.array([[0.08, 0.05]]), np.array([0.2, 0.1])
+    still = {"neighbors": near, "obstacles": near[:0], "waypoint": waypoint}
+    still |= {f"{name}_before": positions for name, positions in still.items()} | {"moved": np.zeros(3)}
+    (standing,) = session.run(None, still)
+    (coming,) = session.run(None, {**still, "neighbors_before": near + 0.03})
+    (unseen,) = session.run(None, {**still, "neighbors_before": np.array([[0.08, 0.05], [0.2, 0.0]])})
+    assert np.abs(coming - standing).max() > 1e-6
+    np.testing.assert_array_equal(unseen, standing)
 
 
 def test_a_graph_that_decides_otherwise_is_not_written(policy, tmp_path, monkeypatch):

@@ -142,4 +142,4 @@ def test_compiled_and_plain_paint_the_same(seed, n_anchors, anchor_width, radius
     )
     sensing = sense(random_world(seed, scenario))
     compiled, plain = observe(sensing, scenario), observe(sensing, scenario, compile_it=False)
-    np.testing.assert_allclose(compiled, plain, rtol=1e-5, atol=1e-30)
+    np.testing.assert_allclose(compiled, plain, rtol=1e-5, atol=1e-20)

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from sb3_flock.sim import Contacts, Scenario
+from sb3_flock.sim.sensing import after
 
 
 def steer(velocities: NDArray[np.float64], scenario: Scenario) -> NDArray[np.float64]:
@@ -43,20 +47,20 @@ def rotate(vectors: NDArray[np.float64], angles: NDArray[np.float64]) -> NDArray
 class Velocities:
     """Velocities of sensed bodies, from where they are and where they were one step ago.
 
-    A vehicle remembers one look and its own last action, nothing that others tell it. A body seen for the first time counts
-    as standing.
+    A vehicle remembers one look and knows its own way since, nothing that others tell it. A body seen for the first time
+    counts as standing.
     """
 
     def __init__(self) -> None:
         self._keys = np.empty(0, np.int64)
         self._positions = np.empty((0, 2))
 
-    def update(self, contacts: Contacts, n_bodies: int, actions: NDArray[np.float64], dt: float) -> NDArray[np.float64]:
+    def update(self, contacts: Contacts, n_bodies: int, moved: NDArray[np.float64], dt: float) -> NDArray[np.float64]:
         """The velocity of each sensed body.
 
         :param contacts: who senses whom, now
         :param n_bodies: bodies in a flock
-        :param actions: ``(flocks, vehicles, 2)``, flown since the last look
+        :param moved: own way since the last look, :attr:`~sb3_flock.sim.Sensing.moved`
         :param dt: time since the last look [s]
         :return: ``(contacts, 2)`` [m/s], over ground, in the observers' frames of now
         """
@@ -66,9 +70,15 @@ class Velocities:
         within = at < len(self._keys)
         known[within] = self._keys[at[within]] == keys[within]
         velocities = np.zeros((len(keys), 2))
-        speeds, turn_rates = actions.reshape(-1, 2)[contacts.observers[known]].T
-        driven = np.stack((speeds * dt, np.zeros_like(speeds)), axis=-1)
-        before = rotate(self._positions[at[known]] - driven, -turn_rates * dt)
+        before = after(self._positions[at[known]], moved.reshape(-1, 2)[contacts.observers[known]])
         velocities[known] = (contacts.positions[known] - before) / dt
         self._keys, self._positions = keys, contacts.positions
         return velocities
+
+    def state_dict(self) -> dict[str, NDArray[Any]]:
+        """The look that is remembered."""
+        return {"keys": self._keys, "positions": self._positions}
+
+    def load_state_dict(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Go on from :meth:`state_dict`."""
+        self._keys, self._positions = state["keys"], state["positions"]

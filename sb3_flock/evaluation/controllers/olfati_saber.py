@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.random import Generator
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from sb3_flock.evaluation.controllers.motion import Velocities, limit, rotate, steer
 from sb3_flock.sim import Contacts, Scenario, Sensing
+from sb3_flock.sim.sensing import after
 
 
 @dataclass(frozen=True)
@@ -51,20 +53,19 @@ class OlfatiSaber:
 
     def reset(self, rngs: Sequence[Generator], scenario: Scenario) -> None:
         """Forget the last episode."""
-        shape = (len(rngs), scenario.n_vehicles, 2)
         self._neighbors, self._obstacles = Velocities(), Velocities()
-        self._actions, self._wanted = np.zeros(shape), np.zeros(shape)
+        self._wanted = np.zeros((len(rngs), scenario.n_vehicles, 2))
         self._waypoints: NDArray[np.float64] | None = None
 
     def act(self, sensing: Sensing, scenario: Scenario) -> NDArray[np.float64]:
         """The actions of the law."""
         gains, dt = self.gains, scenario.time_step
         unit = gains.spacing / _D  # meters a unit of the lattice
-        own = rotate(self._wanted, -self._actions[..., 1] * dt)  # its velocity in the frame of now
+        own = rotate(self._wanted, -sensing.moved[..., 1])  # its velocity in the frame of now
         acceleration = np.zeros_like(own)
 
         contacts = sensing.neighbors
-        velocities = self._neighbors.update(contacts, scenario.n_vehicles, self._actions, dt)
+        velocities = self._neighbors.update(contacts, scenario.n_vehicles, sensing.moved, dt)
         offsets = contacts.positions / unit
         sigma, reach = _sigma_norm(offsets), _sigma_norm(np.array([scenario.link_range / unit, 0.0]))
         pull = _bump(sigma / reach, 0.2) * _uneven_sigmoid(sigma - _sigma_norm(np.array([_D, 0.0])))
@@ -73,7 +74,7 @@ class OlfatiSaber:
         acceleration += _by_observer(contacts, force)
 
         contacts = sensing.obstacles
-        velocities = self._obstacles.update(contacts, scenario.n_obstacles, self._actions, dt)
+        velocities = self._obstacles.update(contacts, scenario.n_obstacles, sensing.moved, dt)
         offsets = contacts.positions / unit
         sigma, reach = _sigma_norm(offsets), _sigma_norm(np.array([gains.obstacle_distance / unit, 0.0]))
         push = _bump(sigma / reach, 0.9) * (_sigmoid(sigma - reach) - 1.0)
@@ -86,16 +87,30 @@ class OlfatiSaber:
         acceleration += gains.gamma_damping * (self._waypoint_velocities(sensing, dt) - own) / unit
 
         self._wanted = limit(own + acceleration * unit * dt, scenario.max_speed)
-        self._actions = steer(self._wanted, scenario)
-        return self._actions
+        return steer(self._wanted, scenario)
+
+    def state_dict(self) -> dict[str, Any]:
+        """What is remembered of the episodes under way: plain values and arrays."""
+        return {
+            "neighbors": self._neighbors.state_dict(),
+            "obstacles": self._obstacles.state_dict(),
+            "wanted": self._wanted,
+            "waypoints": self._waypoints,
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from :meth:`state_dict`."""
+        self._neighbors, self._obstacles = Velocities(), Velocities()
+        self._neighbors.load_state_dict(state["neighbors"])
+        self._obstacles.load_state_dict(state["obstacles"])
+        self._wanted, self._waypoints = state["wanted"], state["waypoints"]
 
     def _waypoint_velocities(self, sensing: Sensing, dt: float) -> NDArray[np.float64]:
         """Of the waypoint over ground, in each vehicle's frame, ``(flocks, vehicles, 2)`` [m/s]; 0 at first sight."""
         before, self._waypoints = self._waypoints, sensing.waypoint_positions
         if before is None:
             return np.zeros_like(sensing.waypoint_positions)
-        driven = np.stack((self._actions[..., 0] * dt, np.zeros_like(self._actions[..., 0])), axis=-1)
-        return (self._waypoints - rotate(before - driven, -self._actions[..., 1] * dt)) / dt
+        return (self._waypoints - after(before, sensing.moved)) / dt
 
 
 _D = 7.0

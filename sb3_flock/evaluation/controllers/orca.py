@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -49,7 +49,6 @@ class Orca:
     def reset(self, rngs: Sequence[Generator], scenario: Scenario) -> None:
         """Forget the last episode."""
         self._neighbors, self._obstacles = Velocities(), Velocities()
-        self._actions = np.zeros((len(rngs), scenario.n_vehicles, 2))
 
     def act(self, sensing: Sensing, scenario: Scenario) -> NDArray[np.float64]:
         """The actions that fly ORCA's velocities."""
@@ -57,8 +56,8 @@ class Orca:
         own_radius = scenario.neighbor_separation / 2 + gains.margin / 2
         obstacle_radius = max(0.0, scenario.obstacle_separation + gains.margin - own_radius)
         wanted = limit(gains.approach * sensing.waypoint_positions, speed).reshape(-1, 2)
-        actions = self._actions.reshape(-1, 2)
-        velocities = rotate(np.stack((actions[:, 0], np.zeros(len(actions))), axis=-1), -actions[:, 1] * dt)
+        forward, turns = sensing.moved.reshape(-1, 2).T
+        velocities = rotate(np.stack((forward / dt, np.zeros_like(forward)), axis=-1), -turns)
 
         reach = 1.1 * max(scenario.link_range, scenario.detection_range)  # all that is in range, whatever the rounding
         simulator = self._new_simulator()  # a new one each time: pyrvo 0.4 keeps pointers to agents that were cleared
@@ -70,14 +69,23 @@ class Orca:
             (sensing.neighbors, self._neighbors, scenario.n_vehicles, own_radius),
             (sensing.obstacles, self._obstacles, scenario.n_obstacles, obstacle_radius),
         ):
-            theirs = memory.update(contacts, n_bodies, self._actions, dt)
+            theirs = memory.update(contacts, n_bodies, sensing.moved, dt)
             rows = zip(contacts.observers.tolist(), contacts.positions.tolist(), theirs.tolist(), strict=True)
             for observer, position, velocity in rows:
                 islands.add(observer, position, velocity, velocity, radius, 0.0, gains.time_horizon, speed)
         simulator.do_step()
         chosen = np.array([islands.velocity(i) for i in range(len(wanted))]).reshape(sensing.waypoint_positions.shape)
-        self._actions = steer(chosen, scenario)
-        return self._actions
+        return steer(chosen, scenario)
+
+    def state_dict(self) -> dict[str, Any]:
+        """What is remembered of the episodes under way: plain values and arrays."""
+        return {"neighbors": self._neighbors.state_dict(), "obstacles": self._obstacles.state_dict()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from :meth:`state_dict`."""
+        self._neighbors, self._obstacles = Velocities(), Velocities()
+        self._neighbors.load_state_dict(state["neighbors"])
+        self._obstacles.load_state_dict(state["obstacles"])
 
 
 class _Islands:

@@ -1,0 +1,104 @@
+import numpy as np
+import pytest
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_flock import train
+from sb3_flock.envs.demonstrations import DemonstratedEnv
+from sb3_flock.envs.flocking_v0 import parallel_env
+from sb3_flock.envs.vec_env import flatten
+from sb3_flock.evaluation.controllers import make_controller
+from sb3_flock.settings import SettingsError
+from sb3_flock.sim import Scenario
+from tests.rl.test_training import quiet, tiny
+
+CROWD = Scenario(n_vehicles=4, n_obstacles=2, arena=0.3, obstacle_arena=0.4, max_cycles=10)
+
+
+def fly(env, actions=None):
+    """Positions and flown actions of one episode."""
+    positions, flown = [env.unwrapped.world.positions], []
+    while env.agents:
+        *_, infos = env.step(dict.fromkeys(env.agents, np.zeros(2, np.float32)) if actions is None else actions.pop(0))
+        positions.append(env.unwrapped.world.positions)
+        flown.append([info.get("action") for info in infos.values()])
+    return np.array(positions), flown
+
+
+def test_the_teacher_flies_as_it_does_alone_and_the_infos_tell_how():
+    env = DemonstratedEnv(CROWD, make_controller("orca"), share=1.0, noise=0.0)
+    env.reset(seed=1)
+    positions, flown = fly(env)
+    alone = parallel_env(CROWD)
+    alone.reset(seed=1)
+    expected, nothing = fly(alone, [dict(zip(env.possible_agents, actions, strict=True)) for actions in flown])
+    np.testing.assert_array_equal(positions, expected)
+    assert {action for step in nothing for action in step} == {None}
+    controller = make_controller("orca")
+    rng = np.random.default_rng(1)
+    sensing = alone.world.reset([rng])
+    controller.reset([rng], CROWD)
+    for actions in flown:
+        np.testing.assert_array_equal(controller.act(sensing, CROWD)[0], actions)
+        sensing, _ = alone.world.step([actions])
+
+
+def test_it_flies_its_share_of_the_episodes_with_its_noise():
+    env = DemonstratedEnv(CROWD, make_controller("olfati-saber"), share=0.3, noise=0.5)
+    env.reset(seed=0)
+    taught = []
+    for _ in range(200):
+        _, flown = fly(env)
+        kinds = {action is None for step in flown for action in step}
+        assert len(kinds) == 1  # the whole episode or none of it
+        if kinds == {False}:
+            actions = np.array(flown)
+            assert (actions >= env.world.action_low).all()
+            assert (actions <= env.world.action_high).all()
+        taught.append(kinds == {False})
+        env.reset()
+    assert np.mean(taught) == pytest.approx(0.3, abs=0.1)
+    assert actions.std(axis=0).min() > 0.01
+
+
+@pytest.mark.parametrize("num_cpus", [0, 2])
+def test_flattened_flocks_tell_what_was_flown(num_cpus):
+    env = flatten(DemonstratedEnv(CROWD, make_controller("orca"), 0.5, 0.1), n_copies=6, num_cpus=num_cpus, seed=0)
+    try:
+        env.reset()
+        *_, infos = env.step(np.zeros((24, 2), np.float32))
+        taught = np.array(["action" in info for info in infos]).reshape(6, 4)
+        assert (taught.all(1) | ~taught.any(1)).all()
+        assert 0 < taught.any(1).sum() < 6
+    finally:
+        env.close()
+
+
+class Record(BaseCallback):
+    """Keeps what each step flew: the teacher's action or, by SB3's rollout, the policy's."""
+
+    def __init__(self):
+        super().__init__()
+        self.taught, self.actions = [], []
+
+    def _on_step(self):
+        infos, given = self.locals["infos"], self.locals["actions"]
+        self.taught.append(["action" in info for info in infos])
+        self.actions.append([info.get("action", action) for info, action in zip(infos, given, strict=True)])
+        return True
+
+
+def test_the_replay_buffer_takes_what_was_flown(tmp_path):
+    record = Record()
+    changes = {"practice.teacher": "orca", "practice.teacher_share": 0.5, "n_flocks": 6, "learning_starts": 100}
+    model = train(tiny(tmp_path, total_timesteps=540, **changes), quiet(), callbacks=[record]).model
+    taught = np.array(record.taught)
+    assert 0.2 < taught.mean() < 0.8
+    buffer = model.replay_buffer
+    stored = model.policy.unscale_action(buffer.actions[: buffer.pos])
+    np.testing.assert_allclose(stored, record.actions, atol=1e-6)
+
+
+def test_mistakes_are_one_line(tmp_path):
+    for name, value in (("teacher", "random"), ("teacher_share", 1.1), ("teacher_noise", -0.1)):
+        with pytest.raises(SettingsError, match=f"{name} = "):
+            tiny(tmp_path, **{f"practice.{name}": value})
