@@ -32,13 +32,12 @@ def test_velocities_are_those_that_the_world_moved_with():
     world, velocities = World(scenario, 3), Velocities()
     sensing = world.reset([episode_rng(4, e) for e in range(3)])
     rng = np.random.default_rng(0)
-    actions = np.zeros((3, 12, 2))
     seen = np.zeros((3, 12, 6), bool)
     checked = newcomers = 0
     before = world.obstacle_positions
     for _ in range(60):
         contacts = sensing.obstacles
-        found = velocities.update(contacts, 6, actions, scenario.time_step)
+        found = velocities.update(contacts, 6, sensing.moved, scenario.time_step)
         flocks, vehicles = np.divmod(contacts.observers, 12)
         old = seen[flocks, vehicles, contacts.bodies]
         if old.any():
@@ -52,6 +51,6 @@ def test_velocities_are_those_that_the_world_moved_with():
         seen[:] = False
         seen[flocks, vehicles, contacts.bodies] = True
         before = world.obstacle_positions
-        sensing, actions = world.step(rng.uniform(world.action_low, world.action_high, (3, 12, 2)))
+        sensing, _ = world.step(rng.uniform(world.action_low, world.action_high, (3, 12, 2)))
     assert checked > 500
     assert newcomers > 20
