@@ -52,7 +52,7 @@ def collected(policy: LoadedPolicy, world: World, noise: float) -> float:
     sensing, total = sense(world), 0.0
     half_range = (world.action_high - world.action_low) / 2
     for step in range(min(STEPS, scenario.max_cycles)):
-        actions = controller.act(sensing, scenario)
+        actions = controller.act(world.sensors.measure(sensing), scenario)
         sensing, clipped = world.step(actions + noise * half_range * rng.normal(size=actions.shape))
         reward = own_reward(reward_terms(sensing, clipped, scenario)).mean()
         total += policy.config.learner.gamma**step * float(reward)
