@@ -25,8 +25,18 @@ def measured(points):
     return (np.atleast_2d(points) - position) @ np.array([[cos, -sin], [sin, cos]])
 
 
+looks = []  # what was measured, where and facing where: only the policies with a second look need it
+steps_back = max(1, round(task["look_back"] / task["time_step"])) if task["look_back"] else 0
+
 for step in range(100):
-    inputs = {"neighbors": measured(neighbors), "obstacles": measured(obstacles), "waypoint": measured(waypoint)[0]}
+    now = {"neighbors": measured(neighbors), "obstacles": measured(obstacles), "waypoint": measured(waypoint)[0]}
+    looks = [*looks, (now, position, heading)][-1 - steps_back :]
+    inputs = now
+    if steps_back:
+        before, place, facing = looks[0]
+        cos, sin = np.cos(facing), np.sin(facing)
+        moved = np.append((position - place) @ np.array([[cos, -sin], [sin, cos]]), heading - facing)  # by odometry
+        inputs = {**now, **{f"{name}_before": points for name, points in before.items()}, "moved": moved}
     (speed, turn_rate), *_ = policy.run(None, inputs)  # m/s, rad/s, to hold for one sampling period
     position = position + speed * task["time_step"] * np.array([np.cos(heading), np.sin(heading)])
     heading += turn_rate * task["time_step"]

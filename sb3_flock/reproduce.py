@@ -35,6 +35,9 @@ SETTINGS = {
 }
 """The paper's experiments by the shipped policy's name."""
 
+OURS = {"ours": "paper-", "ours, with a second look": "second-look-"}
+"""Our rows, and how the names of their policies begin."""
+
 FLEETS = (1, 2, 3, 5, 8, 12, 20, 50, 200)
 """Vehicles that the general policy is flown with."""
 
@@ -81,16 +84,17 @@ def reproduce(out: str | Path, quick: bool = False, console: Console | None = No
     except OSError as error:
         raise SettingsError(f"--out {out}: {error.strerror or error}") from None
     policies = {name: load_policy(name) for name in shipped_policies()}
+    ours = {name: {label: policies[name.replace("paper-", kind)] for label, kind in OURS.items()} for name in SETTINGS}
     parts = [_head(size)]
     with console.status("") as status:
         tables: dict[str, Any] = {}
         for name, scenario in SETTINGS.items():
             status.update(f"{scenario.bodies}: {size.episodes} episodes of each controller")
-            tables[name] = _fly_all(policies[name], scenario, size.episodes)
+            tables[name] = _fly_all(ours[name], scenario, size.episodes)
         parts.append(_tables(tables))
         status.update("a hard test: crossing obstacles")
         crossing = SETTINGS["paper-5v2o"].replace(obstacle_motion="crossing")
-        parts.append(_crossing(_fly_all(policies["paper-5v2o"], crossing, size.episodes)))
+        parts.append(_crossing(_fly_all(ours["paper-5v2o"], crossing, size.episodes)))
         status.update("figures")
         parts.append(_flight_figures(folder, policies["paper-5v2o"]))
         parts.append(_training_curve(folder))
@@ -114,9 +118,12 @@ def _head(size: Size) -> str:
     )
 
 
-def _fly_all(policy: LoadedPolicy, scenario: Scenario, episodes: int) -> dict[str, dict[str, Metric]]:
-    """The metrics of the policy and of every hand-written controller that is installed."""
-    rows = {"ours": evaluate(policy, scenario, episodes, seed=0)}
+def _fly_all(ours: dict[str, LoadedPolicy], scenario: Scenario, episodes: int) -> dict[str, dict[str, Metric]]:
+    """The metrics of the policies, by label, and of every hand-written controller that is installed."""
+    rows = {
+        label: evaluate(policy, scenario.replace(look_back=policy.scenario.look_back), episodes, seed=0)
+        for label, policy in ours.items()
+    }
     for name in CONTROLLERS:
         try:
             controller = make_controller(name)
@@ -134,10 +141,9 @@ def _tables(tables: dict[str, dict[str, dict[str, Metric]]]) -> str:
         lines_ = [f"{scenario.bodies} (`{name}`):\n", *_header()]
         for table, figures in PAPER[scenario.n_vehicles, scenario.n_obstacles].items():
             lines_.append(_row(f"paper, {table}", figures))
-        card = read_card(name)
-        trainings = len(card["seeds"])
-        label = f"median of {trainings} trainings" if trainings > 1 else "one training"
-        lines_.append(_row(f"ours, {label}, on record", median_of_seeds(card)))
+        for label, kind in OURS.items():
+            card = read_card(name.replace("paper-", kind))
+            lines_.append(_row(f"{label}, median of {len(card['seeds'])} trainings, on record", median_of_seeds(card)))
         lines_ += _rows(rows)
         parts.append("\n".join(lines_))
     return "\n\n".join(parts)
@@ -146,13 +152,13 @@ def _tables(tables: dict[str, dict[str, dict[str, Metric]]]) -> str:
 def _crossing(rows: dict[str, dict[str, Metric]]) -> str:
     lines_ = [
         "## A hard test: obstacles that cross the flock\n",
-        "5 vehicles, 2 obstacles, `--scenario crossing` (`paper-5v2o`, not trained for it):\n",
+        "5 vehicles, 2 obstacles, `--scenario crossing` (`paper-5v2o` and `second-look-5v2o`, not trained for it):\n",
     ]
     return "\n".join([*lines_, *_header(), *_rows(rows)])
 
 
 def _rows(rows: dict[str, dict[str, Metric]]) -> list[str]:
-    shown = {"ours": "ours, the shipped one, flown now"}
+    shown = {label: f"{label}, the shipped one, flown now" for label in OURS}
     return [
         _row(shown.get(name, f"`{name}`"), {metric: values.mean for metric, values in metrics.items()})
         for name, metrics in rows.items()
