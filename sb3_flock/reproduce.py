@@ -138,7 +138,8 @@ def _tables(tables: dict[str, dict[str, dict[str, Metric]]]) -> str:
     parts = ["## Tables I and II"]
     for name, rows in tables.items():
         scenario = SETTINGS[name]
-        lines_ = [f"{scenario.bodies} (`{name}`):\n", *_header()]
+        policies = " and ".join(f"`{name.replace('paper-', kind)}`" for kind in OURS.values())
+        lines_ = [f"{scenario.bodies} ({policies}):\n", *_header()]
         for table, figures in PAPER[scenario.n_vehicles, scenario.n_obstacles].items():
             lines_.append(_row(f"paper, {table}", figures))
         for label, kind in OURS.items():

@@ -5,6 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from sb3_flock.cli import main
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -55,8 +57,9 @@ def test_parameter_sharing(tmp_path):
     assert "[[1" in said
 
 
-def test_flying_on_board_needs_numpy_and_onnxruntime_alone(tmp_path):
-    assert main(["export", "paper-5v2o", str(tmp_path / "policy.onnx")]) == 0
+@pytest.mark.parametrize("policy", ["paper-5v2o", "second-look-5v2o"])
+def test_flying_on_board_needs_numpy_and_onnxruntime_alone(tmp_path, policy):
+    assert main(["export", policy, str(tmp_path / "policy.onnx")]) == 0
     said = run("fly_onboard.py", tmp_path / "policy.onnx", cwd=tmp_path)
     last = [float(number) for number in re.findall(r"([\d.]+) m ", said.splitlines()[-1])]
     assert last[0] < 0.15

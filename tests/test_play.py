@@ -16,6 +16,7 @@ from sb3_flock.play import Game, play
 from sb3_flock.rl.loading import load_policy
 from sb3_flock.settings import SettingsError
 from sb3_flock.sim import Scenario
+from sb3_flock.sim.sensors import SensorErrors
 
 
 @pytest.fixture
@@ -116,11 +117,18 @@ def test_a_flight_has_no_end(game):
 
 
 def test_policies_and_laws_that_remember_fly_while_the_flock_changes():
-    for flyer in (load_policy("general"), make_controller("orca")):
-        game = Game(flyer, Scenario(n_vehicles=2, n_obstacles=1))
-        for key in (pygame.K_PLUS, pygame.K_PLUS, pygame.K_MINUS):
+    late = SensorErrors(position_noise=0.01, delay=0.2)
+    for flyer, changes in (
+        (load_policy("general"), {}),
+        (load_policy("general"), {"sensors": late}),
+        (load_policy("second-look-5v2o"), {"look_back": 0.2}),
+        (make_controller("orca"), {}),
+    ):
+        game = Game(flyer, Scenario(n_vehicles=2, n_obstacles=1, **changes))
+        for key in (pygame.K_PLUS, pygame.K_PLUS, pygame.K_v, pygame.K_MINUS):
             press(game, key)
             game.step()
+            game.paint()
         assert game.world.scenario.n_vehicles == 3
 
 

@@ -29,7 +29,13 @@ def test_every_table_and_figure_is_written_and_linked(results):
         assert f"{scenario.bodies} (`{name}`)" in page
         for figures in PAPER[scenario.n_vehicles, scenario.n_obstacles].values():
             assert any(f"{figures['tracking_error']:.3f}" in row and "paper" in row for row in rows)
-    for label in ("`random`", "`go-to-waypoint`", "`olfati-saber`", "`orca`", *(f"{ours}, the shipped one, flown now" for ours in OURS)):
+    for label in (
+        "`random`",
+        "`go-to-waypoint`",
+        "`olfati-saber`",
+        "`orca`",
+        *(f"{ours}, the shipped one, flown now" for ours in OURS),
+    ):
         assert sum(row.startswith(f"| {label} |") for row in rows) == len(SETTINGS) + 1  # and the crossing obstacles
     assert sum(", on record |" in row for row in rows) == len(SETTINGS) * len(OURS)
     assert sum(row.startswith(("| noise of ", "| delay of ")) for row in rows) == 8

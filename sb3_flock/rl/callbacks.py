@@ -90,8 +90,11 @@ class NeighborInclusiveReward(BaseCallback):
 
 
 class DemonstratedActions(BaseCallback):
-    """Stores the actions that were flown where a teacher flew: those in the infos of a
-    :class:`~sb3_flock.envs.demonstrations.DemonstratedEnv`, in place of those the policy gave."""
+    """Stores the actions that a teacher flew, in place of those that the policy gave and nobody flew.
+
+    They stand in the infos of a :class:`~sb3_flock.envs.demonstrations.DemonstratedEnv`. The returns that SB3 logs, and the
+    mixed ones, are of all episodes, the teacher's included.
+    """
 
     def _on_step(self) -> bool:
         for slot, info in enumerate(self.locals["infos"]):
@@ -101,7 +104,7 @@ class DemonstratedActions(BaseCallback):
 
 
 class FlockMetrics(BaseCallback):
-    """Logs the infos' ``metrics`` and ``reward_terms`` as ``flock/...``: means since an episode last ended."""
+    """Logs the infos' ``metrics`` and ``reward_terms`` as ``flock/...``: means since an episode last ended, but a teacher's."""
 
     def __init__(self, verbose: int = 0) -> None:
         super().__init__(verbose)
@@ -110,6 +113,8 @@ class FlockMetrics(BaseCallback):
 
     def _on_step(self) -> bool:
         for info in self.locals["infos"]:
+            if "action" in info:
+                continue
             for name, value in {**info.get("metrics", {}), **info.get("reward_terms", {})}.items():
                 if np.isfinite(value):
                     self._sums[name] += value

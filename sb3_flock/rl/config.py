@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from sb3_flock.settings import NotNegative, Positive, Settings
 from sb3_flock.sim import Scenario
@@ -70,7 +71,7 @@ class PracticeConfig(Settings):
     at the slightest error: practice is harder than the task. In a large flock everyone's exploration disturbs everyone, and
     packs that are loose enough to bear it are what is learned; in a small one too little happens: practice flies four. What
     one action gains in a tenth of a second drowns in the noise of the values: practice decides less often. The learner's
-    gamma is for these longer steps.
+    gamma is for these longer steps. Who explores seldom sees a flock at close rest, and learns to avoid it: a teacher shows it.
     """
 
     vehicles: Width | None = Field(
@@ -140,6 +141,14 @@ class TrainingConfig(Settings):
     )
     init_from: str | None = Field(None, description="policy (zip or run folder) whose weights to start from")
     output_dir: str = Field("runs", description="folder of the run folders")
+
+    @model_validator(mode="after")
+    def _practice_looks_back_as_far(self) -> TrainingConfig:
+        steps = self.scenario.look_back_steps / self.practice.time_step_ratio
+        if not math.isclose(steps, round(steps), rel_tol=1e-6) or (self.scenario.look_back and steps < 0.5):
+            step = f"{self.scenario.time_step * self.practice.time_step_ratio:g} s, the sampling period of practice"
+            raise ValueError(f"look_back = {self.scenario.look_back}: input should be a multiple of {step}")
+        return self
 
     def flown_scenario(self) -> Scenario:
         """The scenario flown while training: ``scenario`` changed as ``practice`` says."""

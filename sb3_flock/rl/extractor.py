@@ -14,9 +14,9 @@ from sb3_flock.settings import SettingsError
 
 
 class FlockCNN(BaseFeaturesExtractor):
-    """Two convolutions with ReLU and one dense layer: three of the state path's four hidden layers (paper, IV-C).
+    """Convolutions with ReLU, two by default, and one dense layer: three of the state path's four hidden layers (paper, IV-C).
 
-    SB3's NatureCNN cannot take a tensor this small, and SB3 does not treat a float ``Box(3, l, l)`` as an image (neither
+    SB3's NatureCNN cannot take a tensor this small, and SB3 does not treat a float ``Box`` as an image (neither
     scaled nor transposed), which is right here.
 
     A tensor of 11 x 11 is too small for a CPU's convolution kernels: every kernel position is gathered instead (its *patch*)

@@ -70,13 +70,11 @@ class LoadedPolicy:
 
         :raises PolicyError: if its tensor has another shape
         """
-        if bool(scenario.look_back) != bool(self.scenario.look_back):
+        shape = self.policy.observation_space.shape
+        if shape != scenario.observation_shape:
             raise PolicyError(
-                f"{self.path}: it flies with look_back = {self.scenario.look_back}, but the scenario has {scenario.look_back}"
-            )
-        if scenario.n_anchors != self.scenario.n_anchors:
-            raise PolicyError(
-                f"{self.path}: it sees {self.scenario.n_anchors} anchors a side, but the scenario has {scenario.n_anchors}"
+                f"{self.path}: it sees tensors of {shape}, but the scenario's (n_anchors = {scenario.n_anchors}, "
+                f"look_back = {scenario.look_back}) are of {scenario.observation_shape}"
             )
         names = ("link_range", "detection_range", "channel_radii", "anchor_width", "look_back", "max_speed", "max_turn_rate")
         values = [(name, getattr(self.scenario, name), getattr(scenario, name)) for name in names]
@@ -290,13 +288,11 @@ def _describe_plain_file(archive: zipfile.ZipFile) -> dict[str, Any]:
         low, high = (_numbers(data["action_space"][name]) for name in ("low", "high"))
         if low != [0.0, -high[1]]:
             raise ValueError("its actions are not a speed and a turn rate")
-        channels, n_anchors, _ = data["observation_space"]["_shape"]
-        if channels != 3:
-            raise ValueError(f"its tensor has {channels} channels, and nothing tells how long it looks back")
+        tensor = _tensor_fields(*data["observation_space"]["_shape"])
         ours = data["policy_class"]["__module__"] == FlockPolicy.__module__
         kwargs = data["policy_kwargs"]
         config = {
-            "scenario": {"max_speed": high[0], "max_turn_rate": high[1], "n_anchors": n_anchors},
+            "scenario": {"max_speed": high[0], "max_turn_rate": high[1], **tensor},
             "network": {
                 "channels": [shape[0] for shape in convolutions],
                 "kernel_size": convolutions[0][2],
@@ -310,6 +306,13 @@ def _describe_plain_file(archive: zipfile.ZipFile) -> dict[str, Any]:
         why = f"not a policy of sb3_flock, nor one of DDPG or TD3 with FlockCNN ({first_line(error)})"
         raise _UnknownPartsError(why) from None
     return {"format": FORMAT, "config": config}
+
+
+def _tensor_fields(channels: int, n_anchors: int, _: int) -> dict[str, Any]:
+    """The fields of a scenario with tensors of this shape; a second look is taken to be that of our configs."""
+    if channels not in (3, 6):
+        raise ValueError(f"its tensors have {channels} channels: 3 or 6 are needed")
+    return {"n_anchors": n_anchors, "look_back": 0.0 if channels == 3 else 0.2}
 
 
 def _numbers(text: str) -> list[float]:

@@ -54,6 +54,7 @@ class Export:
 
 
 _NOTHING = th.empty(0)
+"""What was before, for a policy that looks once."""
 
 
 class Onboard(nn.Module):
@@ -147,8 +148,8 @@ def export(policy: LoadedPolicy, path: str | Path, situations: int = 1000, seed:
     """Write a policy as ONNX, if it decides there as it does here.
 
     The graph is that of :class:`Onboard`, its inputs are :data:`INPUTS`, with a second look :data:`EARLIER_INPUTS` as well, its
-    output is ``action``. What else a vehicle needs to
-    know (ranges, sampling period, units) is in the file's metadata under ``sb3_flock``, as JSON.
+    output is ``action``. What else a vehicle needs to know (ranges, sampling period, units) is in the file's metadata under
+    ``sb3_flock``, as JSON.
 
     :param path: the file, which is written whole or not at all
     :param situations: number of random situations in which it is compared with ``predict``
@@ -244,7 +245,8 @@ def random_situations(scenario: Scenario, count: int, seed: int) -> Iterator[tup
         n_vehicles, n_obstacles = int(rng.integers(1, 13)), int(rng.integers(0, 6))
         bodies = {"n_vehicles": n_vehicles, "n_obstacles": n_obstacles, "obstacle_motion": "walk"}
         arena = max(scenario.link_range, scenario.detection_range) * rng.uniform(2, 5)
-        world = World(scenario.replace(**bodies, arena=arena, obstacle_arena=arena, sensors=SensorErrors()))
+        free = {"arena": arena, "obstacle_arena": arena, "obstacle_starts": None, "sensors": SensorErrors()}
+        world = World(scenario.replace(**bodies, **free, max_cycles=max(1, scenario.look_back_steps)))
         sensing = world.sensors.measure(world.reset([rng]))
         situation = _measured_by_first(world)
         if scenario.look_back:

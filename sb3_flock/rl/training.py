@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
 from sb3_flock.envs.demonstrations import DemonstratedEnv
 from sb3_flock.envs.vec_env import ParameterSharingVecEnv, flatten, make_vec_env
-from sb3_flock.evaluation.controllers import make_controller
+from sb3_flock.evaluation.controllers import TEACHERS
 from sb3_flock.rl.algorithms import build_model
 from sb3_flock.rl.callbacks import DemonstratedActions, FadingNoise, FlockMetrics, NeighborInclusiveReward
 from sb3_flock.rl.checkpoints import LoadedCheckpoint, Stateful, inexactness, newest_checkpoint
@@ -169,8 +169,7 @@ def _flocks(config: TrainingConfig) -> ParameterSharingVecEnv:
     practice, flown = config.practice, config.flown_scenario()
     if practice.teacher is None:
         return make_vec_env(flown, config.n_flocks, config.num_cpus, seed=config.seed)
-    teacher: Any = make_controller(practice.teacher)
-    env = DemonstratedEnv(flown, teacher, practice.teacher_share, practice.teacher_noise)
+    env = DemonstratedEnv(flown, TEACHERS[practice.teacher](), practice.teacher_share, practice.teacher_noise)
     return flatten(env, config.n_flocks, config.num_cpus, config.seed)
 
 

@@ -24,7 +24,9 @@ def observe(sensing: Sensing, scenario: Scenario, compile_it: bool = True) -> ND
     beyond ``goal_radius`` shows on the circle of that radius, so that its bearing is always visible.
 
     With ``look_back`` three more channels tell how the first three have changed: from what was sensed that long ago, in the
-    body's frame of now, to the present. What stands still over ground is 0 there, whatever the vehicle does.
+    body's frame of now, to the present. What stands still over ground is 0 there, whatever the vehicle does; what came into
+    range since shows whole, what left it with a minus sign. All is 0 for a sensing that was not measured by
+    :class:`~sb3_flock.sim.sensors.Sensors`, which remember.
 
     :param compile_it: use numba where it is installed; the numbers are the same to rounding
     :return: ``(flocks, vehicles, 3 or 6, l, l)``, a fresh array
@@ -33,7 +35,7 @@ def observe(sensing: Sensing, scenario: Scenario, compile_it: bool = True) -> ND
     tensor = np.empty((shape[0] * shape[1], *scenario.observation_shape), dtype=np.float32)
     _paint_look(tensor, 0, sensing, scenario, compile_it)
     if scenario.look_back:
-        _paint_look(tensor, 3, sensing.earlier or sensing, scenario, compile_it)
+        _paint_look(tensor, 3, sensing if sensing.earlier is None else sensing.earlier, scenario, compile_it)
         np.subtract(tensor[:, :3], tensor[:, 3:], out=tensor[:, 3:])
     return tensor.reshape(*shape, *scenario.observation_shape)
 

@@ -80,8 +80,9 @@ class Scenario(Settings):
 
     look_back: NotNegative = Field(
         0.0,
-        le=1e3,
-        description="age of a second look, whose difference from the present one adds three channels [s]; 0: none (paper, IV-A)",
+        le=100,
+        description="age of a second look, which adds three channels of what has changed, a multiple of time_step [s]; "
+        "0: none (paper, IV-A)",
     )
 
     sensors: SensorErrors = Field(default_factory=SensorErrors, description="errors of what vehicles measure (paper: none)")
@@ -92,6 +93,8 @@ class Scenario(Settings):
         for near, far in (("neighbor_separation", "link_range"), ("obstacle_separation", "detection_range")):
             if getattr(self, near) > getattr(self, far):
                 raise ValueError(f"{near} = {getattr(self, near)}: input should be at most {far} = {getattr(self, far)}")
+        if not math.isclose(self.look_back, self.look_back_steps * self.time_step, rel_tol=1e-6):
+            raise ValueError(f"look_back = {self.look_back}: input should be a multiple of time_step = {self.time_step}")
         if len(self.obstacle_starts or ()) > self.n_obstacles:
             raise ValueError(
                 f"obstacle_starts has {len(self.obstacle_starts or ())} points: n_obstacles = {self.n_obstacles}"
@@ -118,8 +121,8 @@ class Scenario(Settings):
 
     @property
     def look_back_steps(self) -> int:
-        """Age of the second look, to the nearest step and at least one [steps]; 0 where there is none."""
-        return max(1, round(self.look_back / self.time_step)) if self.look_back else 0
+        """Age of the second look [steps]; 0 where there is none."""
+        return round(self.look_back / self.time_step)
 
     @property
     def bodies(self) -> str:

@@ -81,7 +81,7 @@ class Sensors:
         self._rngs = [np.random.default_rng() for _ in state["rngs"]]
         for rng, saved in zip(self._rngs, state["rngs"], strict=True):
             rng.bit_generator.state = saved
-        for kept, saved in ((self._looks, state["looks"]), (self._measured, state["measured"])):
+        for kept, saved in ((self._looks, state.get("looks", ())), (self._measured, state["measured"])):
             kept.clear()
             kept.extend(_sensing(sensing) for sensing in saved)
 

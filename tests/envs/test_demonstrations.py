@@ -69,6 +69,11 @@ def test_flattened_flocks_tell_what_was_flown(num_cpus):
         taught = np.array(["action" in info for info in infos]).reshape(6, 4)
         assert (taught.all(1) | ~taught.any(1)).all()
         assert 0 < taught.any(1).sum() < 6
+        for _ in range(25):  # over the ends of two episodes
+            *_, infos = env.step(np.zeros((24, 2), np.float32))
+            again = np.array(["action" in info for info in infos]).reshape(6, 4)
+            assert (again.all(1) | ~again.any(1)).all()
+        assert (again.any(1) != taught.any(1)).any()  # each episode is drawn anew
     finally:
         env.close()
 

@@ -68,7 +68,7 @@ LONG = {"scenario.max_cycles": 40, "save_freq": 120, "eval_freq": 180, "total_ti
         ("td3", {"n_steps": 3}),
         ("sac", {}),
         ("ddpg", {"buffer_size": 10_000}),
-        ("ddpg", {"look_back": 0.3, "teacher": "orca", "teacher_share": 0.5}),
+        ("ddpg", {"look_back": 0.4, "teacher": "orca", "teacher_share": 0.5}),
         ("ddpg", {"teacher": "olfati-saber", "teacher_share": 0.9}),
     ],
 )

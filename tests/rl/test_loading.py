@@ -15,7 +15,7 @@ import pytest
 import torch as th
 from stable_baselines3 import DDPG, TD3
 
-from sb3_flock import FlockCNN, FlockPolicy, load_policy, make_vec_env
+from sb3_flock import FlockCNN, FlockPolicy, evaluate, load_policy, make_vec_env
 from sb3_flock.rl.loading import PolicyError
 from tests.rl.conftest import CONFIG
 
@@ -268,6 +268,17 @@ def test_files_of_plain_sb3_with_our_parts_fly_without_trust(tmp_path, algorithm
     expected = plain.predict(observations, deterministic=True)[0]
     np.testing.assert_array_equal(loaded.predict(observations)[0], expected)
     np.testing.assert_array_equal(trusted.predict(observations)[0], expected)
+
+
+@pytest.mark.parametrize("trust", [False, True])
+def test_a_second_look_in_a_file_of_plain_sb3_is_taken_to_be_ours(tmp_path, trust):
+    scenario = CONFIG.scenario.replace(look_back=0.2)
+    plain = DDPG(FlockPolicy, make_vec_env(scenario, seed=0), buffer_size=10, seed=0)
+    plain.save(tmp_path / "plain.zip")
+    with pytest.warns(UserWarning, match="taken to be the default"):
+        loaded = load_policy(tmp_path / "plain.zip", trust=trust)
+    assert loaded.scenario.look_back == 0.2
+    assert evaluate(loaded, episodes=1)["return"].n == 1
 
 
 def test_files_of_plain_sb3_with_other_parts_need_trust(tmp_path):

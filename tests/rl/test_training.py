@@ -150,8 +150,26 @@ def test_a_zip_tells_its_task_and_versions_and_a_policy_flies_any_number(tmp_pat
     assert evaluate(policy, episodes=2)["return"].n == 2
     with pytest.warns(UserWarning, match=r"trained with link_range = 0\.2, flown with 0\.15"):
         evaluate(policy, policy.scenario.replace(link_range=0.15), episodes=1)
-    with pytest.raises(PolicyError, match="it sees 11 anchors a side, but the scenario has 9"):
-        evaluate(policy, policy.scenario.replace(n_anchors=9), episodes=1)
+    for change in ({"n_anchors": 9}, {"look_back": 0.2}):
+        with pytest.raises(PolicyError, match=r"it sees tensors of \(3, 11, 11\), but the scenario's \(n_anchors = "):
+            evaluate(policy, policy.scenario.replace(**change), episodes=1)
+
+
+def test_one_look_back_is_not_another(tmp_path):
+    policy = load_policy(train(tiny(tmp_path, look_back=0.2), quiet()).folder)
+    assert evaluate(policy, episodes=2)["return"].n == 2
+    with pytest.warns(UserWarning, match=r"trained with look_back = 0\.2, flown with 0\.4"):
+        evaluate(policy, policy.scenario.replace(look_back=0.4), episodes=1)
+    with pytest.raises(PolicyError, match=r"it sees tensors of \(6, 11, 11\), but the scenario's .* are of \(3, 11, 11\)"):
+        evaluate(policy, policy.scenario.replace(look_back=0.0), episodes=1)
+
+
+@pytest.mark.parametrize("channels", [[8], [4, 8, 8]])
+def test_any_number_of_convolutions(tmp_path, channels):
+    kernel = {"kernel_size": 2} if len(channels) > 2 else {}
+    result = train(tiny(tmp_path, channels=channels, **kernel), quiet())
+    assert load_policy(result.folder).config.network.channels == tuple(channels)
+    assert evaluate(load_policy(result.folder), episodes=1)["return"].n == 1
 
 
 def test_a_training_can_start_from_trained_weights(tmp_path):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from sb3_flock import flocking_v0
+from sb3_flock.rl.config import TrainingConfig
 from sb3_flock.settings import SettingsError
 from sb3_flock.sim import Scenario, World, episode_rng, observe
 from sb3_flock.sim.sensing import find_contacts
@@ -81,7 +82,7 @@ def test_the_change_is_the_difference_of_two_looks_and_the_first_channels_stay()
     np.testing.assert_array_equal(observe(measured[0], CROWD)[:, :, 3:], 0.0)
 
 
-@pytest.mark.parametrize(("look_back", "time_step", "steps"), [(0.0, 0.1, 0), (0.2, 0.1, 2), (0.2, 0.2, 1), (0.01, 0.1, 1)])
+@pytest.mark.parametrize(("look_back", "time_step", "steps"), [(0.0, 0.1, 0), (0.2, 0.1, 2), (0.3, 0.1, 3), (0.2, 0.2, 1)])
 def test_it_is_of_a_whole_number_of_steps(look_back, time_step, steps):
     assert Scenario(look_back=look_back, time_step=time_step).look_back_steps == steps
 
@@ -110,3 +111,11 @@ def test_an_env_goes_on_from_its_state():
 def test_mistakes_are_one_line():
     with pytest.raises(SettingsError, match="look_back = -0.1: input should be greater than or equal to 0"):
         Scenario(look_back=-0.1)
+    for look_back in (0.01, 0.25):
+        with pytest.raises(SettingsError, match=f"look_back = {look_back}: input should be a multiple of time_step = 0.1"):
+            Scenario(look_back=look_back)
+    for look_back in (0.1, 0.3):
+        with pytest.raises(
+            SettingsError, match=f"look_back = {look_back}: .* multiple of 0.2 s, the sampling period of practice"
+        ):
+            TrainingConfig(scenario=Scenario(look_back=look_back))

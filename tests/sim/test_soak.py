@@ -15,13 +15,15 @@ from sb3_flock.sim.world import WorldError
 
 def random_scenario(rng):
     """A scenario of any size, from centimeters to kilometers."""
+    time_step = 10 ** rng.uniform(-3, 1)
     unit = 10 ** rng.uniform(-2, 3)
     link, detection = unit * rng.uniform(0.05, 2, 2)
     return Scenario(
         n_vehicles=int(rng.integers(1, 30)),
         n_obstacles=int(rng.integers(0, 10)),
         max_cycles=int(rng.integers(1, 60)),
-        time_step=10 ** rng.uniform(-3, 1),
+        time_step=time_step,
+        look_back=time_step * int(rng.integers(0, 4)),
         max_speed=unit * 10 ** rng.uniform(-3, 1),
         max_turn_rate=10 ** rng.uniform(-2, 2),
         obstacle_max_speed=unit * rng.uniform(0, 1),

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
+from sb3_flock.envs.demonstrations import Teacher
 from sb3_flock.evaluation.controllers.olfati_saber import OlfatiSaber
 from sb3_flock.evaluation.controllers.orca import Orca
 from sb3_flock.evaluation.controllers.simple import GoToWaypoint, RandomController
 from sb3_flock.evaluation.episodes import Controller
 from sb3_flock.settings import SettingsError
 
-CONTROLLERS: dict[str, type[Controller]] = {
-    "random": RandomController,
-    "go-to-waypoint": GoToWaypoint,
-    "olfati-saber": OlfatiSaber,
-    "orca": Orca,
-}
+TEACHERS: dict[str, type[Teacher]] = {"olfati-saber": OlfatiSaber, "orca": Orca}
+"""Those that can fly for a policy to learn from, by name."""
+
+CONTROLLERS: dict[str, type[Controller]] = {"random": RandomController, "go-to-waypoint": GoToWaypoint, **TEACHERS}
 """The controllers by name."""
 
-__all__ = ["CONTROLLERS", "GoToWaypoint", "OlfatiSaber", "Orca", "RandomController", "make_controller"]
+__all__ = ["CONTROLLERS", "TEACHERS", "GoToWaypoint", "OlfatiSaber", "Orca", "RandomController", "make_controller"]
 
 
 def make_controller(name: str) -> Controller:
