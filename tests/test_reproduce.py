@@ -26,7 +26,7 @@ def test_every_table_and_figure_is_written_and_linked(results):
         assert (results / f"{stem}.svg").stat().st_size > 5_000
     rows = [line for line in page.splitlines() if line.startswith("| ")]
     for name, scenario in SETTINGS.items():
-        assert f"{scenario.bodies} (`{name}`)" in page
+        assert f"{scenario.bodies} (`{name}` and `second-look-" in page
         for figures in PAPER[scenario.n_vehicles, scenario.n_obstacles].values():
             assert any(f"{figures['tracking_error']:.3f}" in row and "paper" in row for row in rows)
     for label in (

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import io
 import json
-import shutil
+import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch as th
 
 from sb3_flock.evaluation.episodes import evaluate
+from sb3_flock.rl.config import TrainingConfig
 from sb3_flock.rl.loading import load_policy, shipped_policies
+from sb3_flock.rl.saving import MEMBER
 
 CHECK_EPISODES, CHECK_SEED = 50, 7
 """The short flight whose tracking error a card keeps, to tell whether the policy still flies as it did."""
@@ -54,8 +58,8 @@ def ship(name: str, runs: Sequence[str | Path], folder: str | Path, episodes: in
             }
         )
         best = min(best, (float(history["score"].min()), run))
-    shipped = load_policy(best[1])
-    shutil.copyfile(shipped.path, folder / f"{name}.zip")
+    _copy_light(load_policy(best[1]).path, folder / f"{name}.zip")
+    shipped = load_policy(folder / f"{name}.zip")
     check = evaluate(shipped, episodes=CHECK_EPISODES, seed=CHECK_SEED)["tracking_error"].mean
     scenario = shipped.scenario
     card = {
@@ -70,3 +74,23 @@ def ship(name: str, runs: Sequence[str | Path], folder: str | Path, episodes: in
     }
     (folder / f"{name}.json").write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
     return folder / f"{name}.zip"
+
+
+def _copy_light(source: Path, target: Path) -> None:
+    """Copy a policy at half its size: the target networks become the networks they follow, whose numbers are stored once.
+
+    Of its config the folder is left out: it was another machine's.
+    """
+    with zipfile.ZipFile(source) as archive, zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as copy:
+        for name in archive.namelist():
+            content = archive.read(name)
+            if name == "policy.pth":
+                weights = th.load(io.BytesIO(content), weights_only=True)
+                stored = io.BytesIO()
+                th.save({key: weights[key.replace("_target.", ".")] for key in weights}, stored)
+                content = stored.getvalue()
+            elif name == MEMBER:
+                member = json.loads(content)
+                member["config"]["output_dir"] = TrainingConfig().output_dir
+                content = json.dumps(member, indent=1).encode()
+            copy.writestr(name, content)
