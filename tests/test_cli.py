@@ -141,7 +141,7 @@ def test_a_users_mistake_is_one_line_and_exit_code_2(words, expected, capsys, tm
         (["--seed", "-1"], ["--seed", "at least 0"]),
         (["--n-vehicles", "0"], ["n_vehicles = '0'"]),
         (["--json", "no/such/folder.json"], ["--json", "no folder"]),
-        (["--set", "n_anchors=9"], ["11 anchors", "9"]),
+        (["--set", "n_anchors=9"], ["(3, 11, 11)", "n_anchors = 9"]),
         (["--set", "speed=9"], ["speed is not a parameter"]),
         (["--device", "abacus"], ["device"]),
     ],

@@ -128,7 +128,10 @@ def test_a_killed_node_s_trial_goes_on_on_the_other(tmp_path):
         node = cluster.add_node(num_cpus=1)
         run = Sweep(file, "--out", out, "--address", cluster.address)
         run.wait_for_checkpoints(out, 2)
-        os.kill(node.all_processes["raylet"][0].process.pid, signal.SIGKILL)
+        raylet = str(node.all_processes["raylet"][0].process.pid)
+        workers = subprocess.run(["pgrep", "-P", raylet], capture_output=True, text=True, check=True).stdout.split()
+        for pid in (raylet, *workers):  # a worker would go on for a while without it
+            os.kill(int(pid), signal.SIGKILL)
         code, _, errors = run.end()
     finally:
         cluster.shutdown()
