@@ -68,7 +68,12 @@ def test_the_file_tells_what_a_vehicle_needs(exported):
 
 @pytest.mark.parametrize(
     "changes",
-    [{"algo": "sac"}, {"algo": "td3", "network.action_bound": "tanh", "scenario.n_anchors": 15}, {"look_back": 0.2}],
+    [
+        {"algo": "sac"},
+        {"algo": "td3", "network.action_bound": "tanh", "scenario.n_anchors": 15},
+        {"look_back": 0.2},
+        {"look_back": 2.0, "obstacle_starts": [[0.5, 0.5]], "sensors.delay": 0.2},
+    ],
 )
 def test_other_algorithms_networks_and_tensors(tmp_path, changes):
     result = train(tiny(tmp_path, **changes), quiet())
