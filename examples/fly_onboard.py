@@ -19,14 +19,19 @@ neighbors, obstacles = np.array([[0.1, 0.0], [-0.1, 0.05]]), np.array([[-0.3, -0
 waypoint = np.zeros(2)
 
 
+def seen_from(place, facing, points):
+    """Positions in the frame of a body there, forward is +x, left is +y [m]."""
+    cos, sin = np.cos(facing), np.sin(facing)
+    return (np.atleast_2d(points) - place) @ np.array([[cos, -sin], [sin, cos]])
+
+
 def measured(points):
-    """What the sensors give: positions in the body frame, forward is +x, left is +y [m]."""
-    cos, sin = np.cos(heading), np.sin(heading)
-    return (np.atleast_2d(points) - position) @ np.array([[cos, -sin], [sin, cos]])
+    """What the sensors give."""
+    return seen_from(position, heading, points)
 
 
 looks = []  # what was measured, where and facing where: only the policies with a second look need it
-steps_back = max(1, round(task["look_back"] / task["time_step"])) if task["look_back"] else 0
+steps_back = round(task["look_back"] / task["time_step"])
 
 for step in range(100):
     now = {"neighbors": measured(neighbors), "obstacles": measured(obstacles), "waypoint": measured(waypoint)[0]}
@@ -34,8 +39,7 @@ for step in range(100):
     inputs = now
     if steps_back:
         before, place, facing = looks[0]
-        cos, sin = np.cos(facing), np.sin(facing)
-        moved = np.append((position - place) @ np.array([[cos, -sin], [sin, cos]]), heading - facing)  # by odometry
+        moved = np.append(seen_from(place, facing, position)[0], heading - facing)  # by odometry
         inputs = {**now, **{f"{name}_before": points for name, points in before.items()}, "moved": moved}
     (speed, turn_rate), *_ = policy.run(None, inputs)  # m/s, rad/s, to hold for one sampling period
     position = position + speed * task["time_step"] * np.array([np.cos(heading), np.sin(heading)])

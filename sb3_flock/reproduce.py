@@ -84,7 +84,7 @@ def reproduce(out: str | Path, quick: bool = False, console: Console | None = No
     except OSError as error:
         raise SettingsError(f"--out {out}: {error.strerror or error}") from None
     policies = {name: load_policy(name) for name in shipped_policies()}
-    ours = {name: {label: policies[name.replace("paper-", kind)] for label, kind in OURS.items()} for name in SETTINGS}
+    ours = {name: {label: policies[own] for label, own in _ours(name).items()} for name in SETTINGS}
     parts = [_head(size)]
     with console.status("") as status:
         tables: dict[str, Any] = {}
@@ -118,6 +118,11 @@ def _head(size: Size) -> str:
     )
 
 
+def _ours(name: str) -> dict[str, str]:
+    """The names of our policies for an experiment of :data:`SETTINGS`, by label."""
+    return {label: name.replace("paper-", kind) for label, kind in OURS.items()}
+
+
 def _fly_all(ours: dict[str, LoadedPolicy], scenario: Scenario, episodes: int) -> dict[str, dict[str, Metric]]:
     """The metrics of the policies, by label, and of every hand-written controller that is installed."""
     rows = {
@@ -138,12 +143,12 @@ def _tables(tables: dict[str, dict[str, dict[str, Metric]]]) -> str:
     parts = ["## Tables I and II"]
     for name, rows in tables.items():
         scenario = SETTINGS[name]
-        policies = " and ".join(f"`{name.replace('paper-', kind)}`" for kind in OURS.values())
+        policies = " and ".join(f"`{own}`" for own in _ours(name).values())
         lines_ = [f"{scenario.bodies} ({policies}):\n", *_header()]
         for table, figures in PAPER[scenario.n_vehicles, scenario.n_obstacles].items():
             lines_.append(_row(f"paper, {table}", figures))
-        for label, kind in OURS.items():
-            card = read_card(name.replace("paper-", kind))
+        for label, own in _ours(name).items():
+            card = read_card(own)
             lines_.append(_row(f"{label}, median of {len(card['seeds'])} trainings, on record", median_of_seeds(card)))
         lines_ += _rows(rows)
         parts.append("\n".join(lines_))

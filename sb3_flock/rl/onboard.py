@@ -22,7 +22,7 @@ from torch import nn
 from sb3_flock.rl.loading import LoadedPolicy
 from sb3_flock.rl.saving import versions, write_whole
 from sb3_flock.settings import RunError, SettingsError
-from sb3_flock.sim import Scenario, World, episode_rng, observe, sense
+from sb3_flock.sim import Scenario, Sensing, World, episode_rng, observe
 from sb3_flock.sim.sensing import find_contacts
 from sb3_flock.sim.sensors import SensorErrors
 
@@ -248,7 +248,7 @@ def random_situations(scenario: Scenario, count: int, seed: int) -> Iterator[tup
         free = {"arena": arena, "obstacle_arena": arena, "obstacle_starts": None, "sensors": SensorErrors()}
         world = World(scenario.replace(**bodies, **free, max_cycles=max(1, scenario.look_back_steps)))
         sensing = world.sensors.measure(world.reset([rng]))
-        situation = _measured_by_first(world)
+        situation = _measured_by_first(world, sensing)
         if scenario.look_back:
             before = {f"{name}_before": positions for name, positions in situation.items()}
             (x, y), (cos, sin), heading = world.positions[0, 0], world.frames[0, 0], world.headings[0, 0]
@@ -257,11 +257,11 @@ def random_situations(scenario: Scenario, count: int, seed: int) -> Iterator[tup
                 sensing = world.sensors.measure(world.step(actions)[0])
             dx, dy = world.positions[0, 0] - (x, y)
             moved = np.array([cos * dx + sin * dy, cos * dy - sin * dx, world.headings[0, 0] - heading])
-            situation = {**_measured_by_first(world), **before, "moved": moved}
+            situation = {**_measured_by_first(world, sensing), **before, "moved": moved}
         yield situation, observe(sensing, world.scenario)[0, 0]
 
 
-def _measured_by_first(world: World) -> Situation:
+def _measured_by_first(world: World, sensing: Sensing) -> Situation:
     """Positions of all bodies in the first vehicle's frame."""
     neighbors, obstacles = (
         found.positions[found.observers == 0]
@@ -270,7 +270,7 @@ def _measured_by_first(world: World) -> Situation:
             find_contacts(world.positions, world.frames, world.obstacle_positions, np.inf),
         )
     )
-    return {"neighbors": neighbors, "obstacles": obstacles, "waypoint": sense(world).waypoint_positions[0, 0]}
+    return {"neighbors": neighbors, "obstacles": obstacles, "waypoint": sensing.waypoint_positions[0, 0]}
 
 
 @contextlib.contextmanager

@@ -16,7 +16,8 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
 from sb3_flock.envs.demonstrations import DemonstratedEnv
-from sb3_flock.envs.vec_env import ParameterSharingVecEnv, flatten, make_vec_env
+from sb3_flock.envs.flocking_v0 import parallel_env
+from sb3_flock.envs.vec_env import ParameterSharingVecEnv, flatten
 from sb3_flock.evaluation.controllers import TEACHERS
 from sb3_flock.rl.algorithms import build_model
 from sb3_flock.rl.callbacks import DemonstratedActions, FadingNoise, FlockMetrics, NeighborInclusiveReward
@@ -167,9 +168,9 @@ def _prepare(config: TrainingConfig) -> tuple[OffPolicyAlgorithm, VecEnv]:
 def _flocks(config: TrainingConfig) -> ParameterSharingVecEnv:
     """The flocks flown in training, with a teacher where ``practice`` names one."""
     practice, flown = config.practice, config.flown_scenario()
-    if practice.teacher is None:
-        return make_vec_env(flown, config.n_flocks, config.num_cpus, seed=config.seed)
-    env = DemonstratedEnv(flown, TEACHERS[practice.teacher](), practice.teacher_share, practice.teacher_noise)
+    env = parallel_env(flown)
+    if practice.teacher is not None:
+        env = DemonstratedEnv(flown, TEACHERS[practice.teacher](), practice.teacher_share, practice.teacher_noise)
     return flatten(env, config.n_flocks, config.num_cpus, config.seed)
 
 

@@ -9,6 +9,7 @@ from sb3_flock.settings import SettingsError
 from sb3_flock.sim import Scenario, World, episode_rng, observe
 from sb3_flock.sim.sensing import find_contacts
 from sb3_flock.sim.sensors import SensorErrors
+from tests.sim.conftest import assert_another_goes_on_alike
 
 CROWD = Scenario(n_vehicles=8, n_obstacles=4, arena=0.3, obstacle_arena=0.4, look_back=0.3)
 
@@ -99,13 +100,7 @@ def test_an_env_goes_on_from_its_state():
     actions = dict.fromkeys(env.agents, np.array([0.1, 0.5], dtype=np.float32))
     for _ in range(4):
         env.step(actions)
-    other = flocking_v0.parallel_env(env.scenario)
-    other.load_state_dict(env.state_dict())
-    for _ in range(5):
-        ours, theirs = env.step(actions)[0], other.step(actions)[0]
-        for agent in env.agents:
-            np.testing.assert_array_equal(ours[agent], theirs[agent])
-            assert env.observation_space(agent).contains(ours[agent])
+    assert_another_goes_on_alike(env, actions, steps=5)
 
 
 def test_mistakes_are_one_line():

@@ -8,6 +8,7 @@ from sb3_flock.evaluation.episodes import fly
 from sb3_flock.settings import SettingsError
 from sb3_flock.sim import Scenario, World, episode_rng, sense
 from sb3_flock.sim.sensors import SensorErrors
+from tests.sim.conftest import assert_another_goes_on_alike
 
 CROWD = Scenario(n_vehicles=12, n_obstacles=6, arena=0.35, obstacle_arena=0.6)
 
@@ -92,12 +93,7 @@ def test_an_env_shows_what_is_measured_and_goes_on_from_its_state():
     _, exact_rewards, *_, exact_infos = exact.step(actions)
     assert rewards == exact_rewards
     assert all(infos[agent]["metrics"] == exact_infos[agent]["metrics"] for agent in env.agents)
-    other = flocking_v0.parallel_env(env.scenario)
-    other.load_state_dict(env.state_dict())
-    for _ in range(4):
-        ours, theirs = env.step(actions)[0], other.step(actions)[0]
-        for agent in env.agents:
-            np.testing.assert_array_equal(ours[agent], theirs[agent])
+    assert_another_goes_on_alike(env, actions, steps=4)
 
 
 def test_sense_is_always_exact():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -51,9 +50,9 @@ class Velocities:
     counts as standing.
     """
 
-    def __init__(self) -> None:
-        self._keys = np.empty(0, np.int64)
-        self._positions = np.empty((0, 2))
+    def __init__(self, keys: NDArray[np.int64] | None = None, positions: NDArray[np.float64] | None = None) -> None:
+        self._keys = np.empty(0, np.int64) if keys is None else keys
+        self._positions = np.empty((0, 2)) if positions is None else positions
 
     def update(self, contacts: Contacts, n_bodies: int, moved: NDArray[np.float64], dt: float) -> NDArray[np.float64]:
         """The velocity of each sensed body.
@@ -76,9 +75,5 @@ class Velocities:
         return velocities
 
     def state_dict(self) -> dict[str, NDArray[Any]]:
-        """The look that is remembered."""
+        """The look that is remembered, as arguments for another one that goes on from it."""
         return {"keys": self._keys, "positions": self._positions}
-
-    def load_state_dict(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Go on from :meth:`state_dict`."""
-        self._keys, self._positions = state["keys"], state["positions"]

@@ -100,9 +100,7 @@ class OlfatiSaber:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on from :meth:`state_dict`."""
-        self._neighbors, self._obstacles = Velocities(), Velocities()
-        self._neighbors.load_state_dict(state["neighbors"])
-        self._obstacles.load_state_dict(state["obstacles"])
+        self._neighbors, self._obstacles = Velocities(**state["neighbors"]), Velocities(**state["obstacles"])
         self._wanted, self._waypoints = state["wanted"], state["waypoints"]
 
     def _waypoint_velocities(self, sensing: Sensing, dt: float) -> NDArray[np.float64]:
