@@ -28,6 +28,9 @@ class RewardWeights(Settings):
         12.0, description="penalty for each obstacle nearer than obstacle_separation (paper, IV-B: 1)"
     )
     epsilon: NotNegative = Field(10.0, description="weight of the distance to the waypoint [1/m] (paper leaves it open)")
+    max_distance: Positive | None = Field(
+        None, description="distance to the waypoint beyond which it costs no more [m]; null: none (ours; paper: none)"
+    )
     beta: float = Field(
         -0.02, ge=-1e6, le=0, description="weight of the squared action [m/s, rad/s], not positive (paper leaves it open)"
     )
@@ -46,12 +49,13 @@ def reward_terms(sensing: Sensing, actions: NDArray[np.float64], scenario: Scena
     :return: ``connectivity``, ``obstacle``, ``waypoint`` and ``control``, each ``(flocks, vehicles)``
     """
     weights = scenario.reward
+    distances = np.minimum(sensing.waypoint_distances, np.inf if weights.max_distance is None else weights.max_distance)
     too_close = sensing.neighbors.count(scenario.neighbor_separation)
     linked = sensing.neighbors.count() - too_close
     terms = {
         "connectivity": weights.link_bonus * linked - weights.separation_penalty * too_close,
         "obstacle": -weights.obstacle_penalty * sensing.obstacles.count(scenario.obstacle_separation),
-        "waypoint": -weights.epsilon * sensing.waypoint_distances,
+        "waypoint": -weights.epsilon * distances,
         "control": weights.beta * (np.square(actions[..., 0]) + np.square(actions[..., 1])),
     }
     return {name: weights.scale * term for name, term in terms.items()}

@@ -50,6 +50,13 @@ def test_weights_and_scale_multiply_their_terms():
     np.testing.assert_allclose(terms["waypoint"][0, 0], -0.05)
 
 
+def test_beyond_the_largest_distance_the_waypoint_costs_no_more():
+    near = PAPER.replace(reward=PAPER.reward.replace(max_distance=0.3))
+    world = place(near, [(0.0, 0.0), (0.8, 0.0)], [0.0] * 2, waypoint=(1.0, 0.0))
+    terms = reward_terms(sense(world), np.zeros((1, 2, 2)), world.scenario)
+    np.testing.assert_allclose(terms["waypoint"][0], [-0.15, -0.1])
+
+
 def test_the_mix_by_hand():
     observers, neighbors = np.array([(0, 1), (0, 2), (1, 0), (2, 0)]).T
     mixed = mix_rewards(np.array([1.0, 2.0, 4.0]), observers, neighbors, 0.7)

@@ -42,7 +42,12 @@ def random_scenario(rng):
         n_anchors=int(rng.integers(2, 20)),
         goal_radius=unit * rng.uniform(0.1, 3),
         anchor_width=rng.uniform(0.1, 3),
-        reward=RewardWeights(epsilon=10 ** rng.uniform(-3, 2), beta=-(10 ** rng.uniform(-3, 1)), lambda_=rng.uniform(0, 1)),
+        reward=RewardWeights(
+            epsilon=10 ** rng.uniform(-3, 2),
+            max_distance=unit * rng.uniform(0.1, 3) if rng.random() < 0.5 else None,
+            beta=-(10 ** rng.uniform(-3, 1)),
+            lambda_=rng.uniform(0, 1),
+        ),
     )
 
 
@@ -75,6 +80,7 @@ def soak(vehicle_steps, seed):
             assert tensors.max() <= n + m + 1
             terms = reward_terms(sensing, clipped, scenario)
             farthest = np.sqrt(8) * (np.abs(world.positions).max() + scenario.arena + np.abs(world.waypoints).max())
+            farthest = min(farthest, weights.max_distance or np.inf)
             effort = scenario.max_speed**2 + scenario.max_turn_rate**2
             bounds = {
                 "connectivity": (-weights.separation_penalty * (n - 1), weights.link_bonus * (n - 1)),
