@@ -198,7 +198,7 @@ def _training_curve(folder: Path) -> str:
     series = {}
     for name, scenario in SETTINGS.items():
         seeds = read_card(name)["seeds"]
-        steps = load_policy(name).config.flown_scenario()
+        steps = load_policy(name).config.flown_scenarios()[0]
         episodes = np.array(seeds[0]["curve"]["timesteps"]) / (steps.n_vehicles * steps.max_cycles)
         returns = np.array([seed["curve"]["return"] for seed in seeds])
         series[scenario.bodies] = (episodes, returns)

@@ -29,4 +29,4 @@ def test_the_plain_recipe_is_the_papers():
     reward = config.scenario.reward
     assert (reward.link_bonus, reward.separation_penalty, reward.obstacle_penalty, reward.scale) == (1, 1, 1, 1)
     assert (config.algo, config.network.n_critics, config.learner.update_ratio) == ("ddpg", 1, 1)
-    assert config.flown_scenario().replace(obstacle_arena=None) == config.scenario
+    assert config.flown_scenarios()[0].replace(obstacle_arena=None) == config.scenario

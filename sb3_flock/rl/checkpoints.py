@@ -154,7 +154,7 @@ def newest_checkpoint(
     :param tell: called with one line about each damaged one that is passed over
     """
     pixels = math.prod(config.scenario.observation_shape)
-    slots = config.n_flocks * config.flown_scenario().n_vehicles
+    slots = config.n_flocks * sum(scenario.n_vehicles for scenario in config.flown_scenarios())
     most = _MOST_BESIDES + 4 * (2 * pixels + 16) * (config.learner.buffer_size + 2 * slots)
     for path in reversed(checkpoint_paths(folder)):
         try:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from sb3_flock.settings import NotNegative, Positive, Settings
 from sb3_flock.sim import Scenario
@@ -13,6 +13,8 @@ from sb3_flock.sim.scenario import MAX_BODIES
 
 Width = Annotated[int, Field(ge=1, le=65_536)]
 Count = Annotated[int, Field(ge=0, le=10**12)]
+Sizes = Annotated[tuple[Width, ...], BeforeValidator(lambda value: (value,) if isinstance(value, int) else value)]
+"""One or several; a number alone is one."""
 
 
 class NetworkConfig(Settings):
@@ -74,8 +76,11 @@ class PracticeConfig(Settings):
     gamma is for these longer steps. Who explores seldom sees a flock at close rest, and learns to avoid it: a teacher shows it.
     """
 
-    vehicles: Width | None = Field(
-        4, description="vehicles of a flock; null: the task's. The policy fits any number, and four teach it best (ours)"
+    vehicles: Sizes | None = Field(
+        (4,),
+        min_length=1,
+        max_length=16,
+        description="sizes of the flocks [vehicles]; null: the task's. The policy fits any number, and four teach it best (ours)",
     )
     extra_obstacles: int = Field(
         1, ge=0, le=MAX_BODIES, description="obstacles added, where the task has any (ours; paper: 0)"
@@ -117,7 +122,7 @@ class TrainingConfig(Settings):
     network: NetworkConfig = Field(default_factory=NetworkConfig, description="the networks")
 
     total_timesteps: int = Field(300_000, ge=1, le=10**12, description="transitions to train for")
-    n_flocks: Width = Field(32, description="flocks flown side by side")
+    n_flocks: Width = Field(32, description="flocks flown side by side, of each size practiced")
     num_cpus: int = Field(
         0, ge=0, le=1024, description="SuperSuit worker processes; 0: fly in the training process (faster)"
     )
@@ -150,16 +155,16 @@ class TrainingConfig(Settings):
             raise ValueError(f"look_back = {self.scenario.look_back}: input should be a multiple of {step}")
         return self
 
-    def flown_scenario(self) -> Scenario:
-        """The scenario flown while training: ``scenario`` changed as ``practice`` says."""
+    def flown_scenarios(self) -> list[Scenario]:
+        """The scenarios flown side by side while training: ``scenario`` changed as ``practice`` says, one a size of flock."""
         scenario, practice = self.scenario, self.practice
-        return scenario.replace(
+        flown = scenario.replace(
             time_step=scenario.time_step * practice.time_step_ratio,
             max_cycles=max(1, round(scenario.max_cycles / practice.time_step_ratio)),
-            n_vehicles=practice.vehicles or scenario.n_vehicles,
             n_obstacles=scenario.n_obstacles + (practice.extra_obstacles if scenario.n_obstacles else 0),
             obstacle_arena=scenario.obstacle_half_side
             * (1.0 if scenario.obstacle_starts else practice.obstacle_arena_ratio),
             neighbor_separation=min(scenario.neighbor_separation * practice.separation_ratio, scenario.link_range),
             obstacle_separation=min(scenario.obstacle_separation * practice.separation_ratio, scenario.detection_range),
         )
+        return [flown.replace(n_vehicles=vehicles) for vehicles in practice.vehicles or (scenario.n_vehicles,)]

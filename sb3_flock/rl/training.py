@@ -17,6 +17,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
 from sb3_flock.envs.demonstrations import DemonstratedEnv
 from sb3_flock.envs.flocking_v0 import parallel_env
+from sb3_flock.envs.side_by_side import SideBySide
 from sb3_flock.envs.vec_env import ParameterSharingVecEnv, flatten
 from sb3_flock.evaluation.controllers import TEACHERS
 from sb3_flock.rl.algorithms import build_model
@@ -154,8 +155,7 @@ def _prepare(config: TrainingConfig) -> tuple[OffPolicyAlgorithm, VecEnv]:
     """The model, untrained, and its flocks; whatever can be wrong with a config comes out here."""
     th.set_num_threads(config.torch_threads or (1 if config.learner.batch_size < _WIDE_BATCH else _cores()))
     check_device(config.device)
-    flown = config.flown_scenario()
-    for scenario in (config.scenario, flown):  # too crowded to start? Better told before the run folder is made
+    for scenario in (config.scenario, *config.flown_scenarios()):  # too crowded to start? Better told before the run folder is made
         World(scenario).reset([episode_rng(config.seed, 0)])
     env = VecMonitor(_flocks(config))
     try:
@@ -167,11 +167,16 @@ def _prepare(config: TrainingConfig) -> tuple[OffPolicyAlgorithm, VecEnv]:
 
 def _flocks(config: TrainingConfig) -> ParameterSharingVecEnv:
     """The flocks flown in training, with a teacher where ``practice`` names one."""
-    practice, flown = config.practice, config.flown_scenario()
-    env = parallel_env(flown)
-    if practice.teacher is not None:
-        env = DemonstratedEnv(flown, TEACHERS[practice.teacher](), practice.teacher_share, practice.teacher_noise)
+    flocks = [_flock(config, scenario) for scenario in config.flown_scenarios()]
+    env = flocks[0] if len(flocks) == 1 else SideBySide(flocks)
     return flatten(env, config.n_flocks, config.num_cpus, config.seed)
+
+
+def _flock(config: TrainingConfig, flown: Scenario) -> parallel_env:
+    practice = config.practice
+    if practice.teacher is None:
+        return parallel_env(flown)
+    return DemonstratedEnv(flown, TEACHERS[practice.teacher](), practice.teacher_share, practice.teacher_noise)
 
 
 def _run(
@@ -184,10 +189,9 @@ def _run(
     signals: Signals,
 ) -> TrainingResult:
     """Learn until the end or a signal."""
-    flown = config.flown_scenario()
-    console.print(_summary(config, flown, model, folder), soft_wrap=True, highlight=False)
+    console.print(_summary(config, model, folder), soft_wrap=True, highlight=False)
     progress = FlockProgress(console, config.total_timesteps)
-    rewards, metrics = NeighborInclusiveReward(flown.reward.lambda_), FlockMetrics()
+    rewards, metrics = NeighborInclusiveReward(config.scenario.reward.lambda_), FlockMetrics()
     evaluation = Evaluation(config, folder, progress)
     stateful: dict[str, Stateful] = {"rewards": rewards, "metrics": metrics, "evaluation": evaluation}
     parts: list[BaseCallback] = [
@@ -208,7 +212,7 @@ def _run(
             model.learn(
                 config.total_timesteps - model.num_timesteps,
                 CallbackList(parts),
-                log_interval=config.n_flocks * flown.n_vehicles,
+                log_interval=model.n_envs,
                 reset_num_timesteps=checkpoint is None,
             )
         save_model(model, folder / "final_model.zip", config)
@@ -256,11 +260,12 @@ def _build(config: TrainingConfig, env: VecEnv) -> OffPolicyAlgorithm:
     return model
 
 
-def _summary(config: TrainingConfig, flown: Scenario, model: OffPolicyAlgorithm, folder: Path) -> str:
+def _summary(config: TrainingConfig, model: OffPolicyAlgorithm, folder: Path) -> str:
     """What is trained, on what, where: one line."""
+    flown = config.flown_scenarios()
     return (
-        f"{config.algo} for {config.scenario.bodies}; practice in "
-        f"{config.n_flocks} flocks of {flown.n_vehicles} among {flown.n_obstacles}; device {model.device}, "
+        f"{config.algo} for {config.scenario.bodies}; practice in {config.n_flocks} flocks of "
+        f"{' and of '.join(str(scenario.n_vehicles) for scenario in flown)} among {flown[0].n_obstacles}; device {model.device}, "
         f"torch threads {th.get_num_threads()} on {_cores()} cores; {folder}"
     )
 

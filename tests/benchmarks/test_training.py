@@ -49,7 +49,7 @@ def learner(kind, env):
 
 def test_updates(benchmark):
     """Rounds of updates of each kind in turn, so that whatever else the machine does falls on all of them."""
-    env = make_vec_env(CONFIG.flown_scenario(), 8, seed=0)
+    env = make_vec_env(CONFIG.flown_scenarios()[0], 8, seed=0)
     models = {kind: learner(kind, env) for kind in KINDS}
     seconds = {kind: [] for kind in KINDS}
 

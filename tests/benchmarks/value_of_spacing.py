@@ -63,7 +63,7 @@ def main(name: str, picture: str | None = None) -> None:
     """Print the three values by spacing; draw them, too."""
     th.set_num_threads(1)
     policy = load_policy(name)
-    scenario = policy.config.flown_scenario().replace(n_vehicles=3, n_obstacles=0)
+    scenario = policy.config.flown_scenarios()[0].replace(n_vehicles=3, n_obstacles=0)
     columns = {
         "believed": [believed(policy, triangles(scenario, spacing)) for spacing in SPACINGS],
         "true": [collected(policy, triangles(scenario, spacing), 0.0) for spacing in SPACINGS],

@@ -69,7 +69,7 @@ LONG = {"scenario.max_cycles": 40, "save_freq": 120, "eval_freq": 180, "total_ti
         ("sac", {}),
         ("ddpg", {"buffer_size": 10_000}),
         ("ddpg", {"look_back": 0.4, "teacher": "orca", "teacher_share": 0.5}),
-        ("ddpg", {"teacher": "olfati-saber", "teacher_share": 0.9}),
+        ("ddpg", {"teacher": "olfati-saber", "teacher_share": 0.9, "practice.vehicles": [1, 2]}),
     ],
 )
 def test_a_resumed_run_ends_like_one_never_interrupted_to_the_last_bit(tmp_path, algo, changes):

@@ -74,9 +74,9 @@ def test_a_wrong_override_is_one_line(assignment):
 
 
 def test_practice_flies_its_own_number_of_vehicles_or_the_tasks():
-    for vehicles, flown in ((3, 3), (9, 9), (None, 5)):
+    for vehicles, flown in ((3, [3]), ([9], [9]), (None, [5]), ([3, 20], [3, 20])):
         config = load_config(TrainingConfig, overrides={"n_vehicles": 5, "practice.vehicles": vehicles})
-        assert config.flown_scenario().n_vehicles == flown
+        assert [scenario.n_vehicles for scenario in config.flown_scenarios()] == flown
         assert config.scenario.n_vehicles == 5
 
 
@@ -84,20 +84,20 @@ def test_practice_is_harder_than_the_task_and_scales_with_it():
     overrides = {"n_obstacles": 1, "obstacle_arena": 40.0, "neighbor_separation": 2.0, "link_range": 2.04}
     overrides |= {"obstacle_separation": 3.0, "detection_range": 5.0}
     config = load_config(TrainingConfig, overrides={**overrides, "extra_obstacles": 3, "separation_ratio": 1.1})
-    flown = config.flown_scenario()
+    flown = config.flown_scenarios()[0]
     assert (flown.n_obstacles, flown.obstacle_arena, flown.neighbor_separation) == (4, 20.0, 2.04)
     assert flown.obstacle_separation == pytest.approx(3.3)
     assert config.scenario.n_obstacles == 1
     none = load_config(TrainingConfig, overrides={"n_obstacles": 0, "extra_obstacles": 3})
-    assert none.flown_scenario().n_obstacles == 0
+    assert none.flown_scenarios()[0].n_obstacles == 0
 
 
 def test_practice_takes_longer_steps_for_the_same_time():
     config = load_config(TrainingConfig, overrides={"max_cycles": 200, "time_step": 0.1, "time_step_ratio": 2.5})
-    flown = config.flown_scenario()
+    flown = config.flown_scenarios()[0]
     assert (flown.max_cycles, flown.time_step) == (80, 0.25)
     shortest = load_config(TrainingConfig, overrides={"max_cycles": 1, "time_step_ratio": 10})
-    assert shortest.flown_scenario().max_cycles == 1
+    assert shortest.flown_scenarios()[0].max_cycles == 1
 
 
 def test_yaml_is_plain():

@@ -56,7 +56,7 @@ def _untrained(config):
     from sb3_flock import make_vec_env
     from sb3_flock.rl.algorithms import build_model
 
-    model = build_model(config, make_vec_env(config.flown_scenario(), config.n_flocks, seed=0))
+    model = build_model(config, make_vec_env(config.flown_scenarios()[0], config.n_flocks, seed=0))
     return {name: value.clone() for name, value in model.policy.state_dict().items()}
 
 
