@@ -155,7 +155,7 @@ def _prepare(config: TrainingConfig) -> tuple[OffPolicyAlgorithm, VecEnv]:
     """The model, untrained, and its flocks; whatever can be wrong with a config comes out here."""
     th.set_num_threads(config.torch_threads or (1 if config.learner.batch_size < _WIDE_BATCH else _cores()))
     check_device(config.device)
-    for scenario in (config.scenario, *config.flown_scenarios()):  # too crowded to start? Better told before the run folder is made
+    for scenario in (config.scenario, *config.flown_scenarios()):  # too crowded? Better told before there is a run folder
         World(scenario).reset([episode_rng(config.seed, 0)])
     env = VecMonitor(_flocks(config))
     try:

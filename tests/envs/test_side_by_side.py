@@ -51,12 +51,10 @@ def test_rewards_are_mixed_within_a_flock():
     assert (venv.num_envs, venv.n_agents) == (16, 8)
     venv.reset()
     for _ in range(5):
-        _, rewards, _, infos = venv.step(np.full((16, 2), 0.05, dtype=np.float32))
-    callback = NeighborInclusiveReward(0.5)
-    callback._agents_per_copy = venv.n_agents
+        _, _, _, infos = venv.step(np.full((16, 2), 0.05, dtype=np.float32))
     marked = np.zeros(16)
     marked[[2, 3, 4, 5, 6]] = 1.0  # the five of the first copy
-    mixed = callback.mix(marked, infos)
+    mixed = NeighborInclusiveReward(0.5, n_agents=8).mix(marked, infos)
     assert mixed.tolist() == marked.tolist()
     assert any(len(info["neighbors"]) for info in infos[2:7])
 
