@@ -1,7 +1,8 @@
 """How closely a flock could track while obstacles cross it: ``python tests/benchmarks/crossing_limits.py``.
 
 First a bound: at each settled moment by itself, five places of a hexagonal lattice, free of the obstacles and connected, as
-near to the waypoint as possible. Then flights of two planners that see everything, what comes included, and let ORCA fly their goals:
+near to the waypoint as possible. Then flights of two planners that see everything, what comes included, and let ORCA fly their
+goals:
 
 - `aside` moves the goal of the whole flock out of the obstacles' way;
 - `places` gives each vehicle its own place in such a pack, the one with the shortest ways.
