@@ -186,19 +186,21 @@ def test_a_real_window_with_a_real_mouse_and_keys(screen, tmp_path):
         time.sleep(0.3)
 
     def wait_for(said, seconds=60):
+        """The window whose title says so: SDL may make another one before it is the last."""
         deadline = time.monotonic() + seconds
-        while said not in (title := xdotool("getwindowname", window)):
-            assert time.monotonic() < deadline, title
+        while True:
+            visible = xdotool("search", "--onlyvisible", "--class", ".").split()
+            found = {number: xdotool("getwindowname", number) for number in visible}
+            for number, title in found.items():
+                if said in title:
+                    return number
+            assert (process.poll(), time.monotonic() < deadline) == (None, True), found
             time.sleep(0.05)
 
     command = [sys.executable, "-m", "sb3_flock.cli", "play", "--controller", "go-to-waypoint", "--n-vehicles", "4"]
     process = subprocess.Popen([*command, "--set", "waypoint_route=[[0.5, 0.5]]", "--set", "obstacle_max_speed=0"])
     try:
-        window, deadline = "", time.monotonic() + 60
-        while not window:
-            window = xdotool("search", "--onlyvisible", "--class", ".")
-            assert (process.poll(), time.monotonic() < deadline) == (None, True)
-        wait_for("4 vehicles, 1 obstacle")
+        window = wait_for("4 vehicles, 1 obstacle")
         point_at(60, HEADER + 60)
         xdotool("click", 1)
         wait_for("2 obstacles")
