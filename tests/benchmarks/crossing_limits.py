@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_flock.evaluation.controllers import Orca
+from sb3_flock.evaluation.controllers.motion import rotate
 from sb3_flock.evaluation.controllers.orca import OrcaGains
 from sb3_flock.evaluation.metrics import EpisodeMetrics
 from sb3_flock.sim import Scenario, World, episode_rng, own_reward, reward_terms
@@ -108,9 +109,8 @@ def flown(planner: Planner | None, episodes: int, gains: OrcaGains | None = None
     for step in range(CROSSING.max_cycles):
         if planner is not None:
             wanted = planner(world, world.obstacle_positions - world.waypoints[:, None], _velocities(world, step))
-            cos, sin = np.cos(world.headings), np.sin(world.headings)
-            x, y = np.moveaxis(wanted + world.waypoints[:, None] - world.positions, -1, 0)
-            sensing = replace(sensing, waypoint_positions=np.stack((cos * x + sin * y, cos * y - sin * x), axis=-1))
+            offsets = wanted + world.waypoints[:, None] - world.positions
+            sensing = replace(sensing, waypoint_positions=rotate(offsets, -world.headings))
         sensing, clipped = world.step(orca.act(sensing, CROSSING))
         metrics.update(world, sensing, own_reward(reward_terms(sensing, clipped, CROSSING)))
     return metrics.result()
