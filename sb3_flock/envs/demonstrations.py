@@ -1,8 +1,8 @@
-"""Flocks that a hand-written controller flies in some of the episodes, for a policy to learn from."""
+"""Flocks that a teacher flies in some of the episodes, or advises in all of them, for a policy to learn from."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -10,11 +10,11 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from sb3_flock.envs.flocking_v0 import Action, Observation, parallel_env
-from sb3_flock.sim import Scenario, Sensing
+from sb3_flock.sim import Scenario, Sensing, World
 
 
 class Teacher(Protocol):
-    """A controller (:class:`~sb3_flock.evaluation.episodes.Controller`) whose memory can be saved."""
+    """Flies as a :class:`~sb3_flock.evaluation.episodes.Controller`, with a memory that can be saved."""
 
     def reset(self, rngs: Sequence[Generator], scenario: Scenario) -> None:
         """Episodes begin, one generator a flock."""
@@ -37,39 +37,45 @@ class DemonstratedEnv(parallel_env):
     noise on its actions, is drawn from the env's own random stream.
 
     :param scenario: the task
-    :param teacher: who flies
+    :param teacher: makes the one who flies; it is given the world, to see more than vehicles do
     :param share: probability that an episode is the teacher's, in [0, 1]
     :param noise: standard deviation of the noise on the teacher's actions [half the action range]
+    :param advises: also say in every step, whoever flies, what the teacher would do: each agent's info has it as ``advice``
     """
 
-    def __init__(self, scenario: Scenario, teacher: Teacher, share: float, noise: float) -> None:
+    def __init__(
+        self, scenario: Scenario, teacher: Callable[[World], Teacher], share: float, noise: float, advises: bool = False
+    ) -> None:
         super().__init__(scenario)
-        self.teacher, self.share, self.noise = teacher, share, noise
+        self.teacher, self.share, self.noise, self.advises = teacher(self.world), share, noise, advises
+        self._advice: NDArray[np.floating] | None = None
         self._planned: NDArray[np.float64] | None = None
 
     def step(
         self, actions: dict[str, Action]
     ) -> tuple[dict[str, Observation], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
         """Move everything by one sampling period."""
-        flown = self._planned
-        if flown is None:
-            return super().step(actions)
-        result = super().step(dict(zip(self.possible_agents, flown, strict=True)))
-        for info, action in zip(result[-1].values(), flown, strict=True):
-            info["action"] = action
+        advice, flown = self._advice, self._planned
+        result = super().step(actions if flown is None else dict(zip(self.possible_agents, flown, strict=True)))
+        for name, told in (("action", flown), ("advice", advice if self.advises else None)):
+            if told is not None:
+                for info, action in zip(result[-1].values(), told, strict=True):
+                    info[name] = action
         return result
 
     def state_dict(self) -> dict[str, Any]:
-        """The episode under way, the random stream and, in an episode of the teacher's, what it remembers and does next."""
-        taught = None if self._planned is None else {"planned": self._planned, "memory": self.teacher.state_dict()}
+        """The episode under way, the random stream and, where the teacher acts, what it remembers, says and does next."""
+        taught = None
+        if self._advice is not None:
+            taught = {"advice": self._advice, "planned": self._planned, "memory": self.teacher.state_dict()}
         return {**super().state_dict(), "taught": taught}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on with the episode of :meth:`state_dict`."""
         super().load_state_dict(state)
-        self._planned = None
+        self._advice = self._planned = None
         if state["taught"] is not None:
-            self._planned = state["taught"]["planned"]
+            self._advice, self._planned = state["taught"]["advice"], state["taught"]["planned"]
             self.teacher.load_state_dict(state["taught"]["memory"])
 
     def _measure(self, sensing: Sensing) -> Sensing:
@@ -81,10 +87,12 @@ class DemonstratedEnv(parallel_env):
             self.teacher.reset([self._rng], self.scenario)
         else:
             taught = self._planned is not None
-        self._planned = self._decide(measured, self._rng) if taught else None
+        self._advice = self._planned = None
+        if taught or self.advises:
+            self._advice = self.teacher.act(measured, self.scenario)[0]
+            self._planned = self._noisy(self._advice, self._rng) if taught else None
         return measured
 
-    def _decide(self, measured: Sensing, rng: Generator) -> NDArray[np.float64]:
-        actions = self.teacher.act(measured, self.scenario)[0]
+    def _noisy(self, actions: NDArray[np.floating], rng: Generator) -> NDArray[np.float64]:
         low, high = self.world.action_low, self.world.action_high
         return np.clip(actions + self.noise * (high - low) / 2 * rng.normal(size=actions.shape), low, high)

@@ -54,6 +54,7 @@ def build_model(config: TrainingConfig, env: VecEnv) -> OffPolicyAlgorithm:
     gradient_steps = max(1, round(learner.update_ratio * learner.train_freq * env.num_envs))
     algorithm, policy = ALGORITHMS[config.algo]
     buffer = _replay_buffer_class(config)
+    more: dict[str, Any] = {"guidance": learner.guidance} if algorithm is FlockDDPG else {}
     return algorithm(
         policy,
         env,
@@ -67,11 +68,12 @@ def build_model(config: TrainingConfig, env: VecEnv) -> OffPolicyAlgorithm:
         gradient_steps=gradient_steps,
         n_steps=learner.n_steps,
         replay_buffer_class=buffer,
-        replay_buffer_kwargs={"mirror": learner.mirror} if buffer else None,
+        replay_buffer_kwargs={"mirror": learner.mirror, "advice": learner.guidance > 0} if buffer else None,
         action_noise=_noise(config),
         policy_kwargs=policy_kwargs(config),
         seed=config.seed,
         device=config.device,
+        **more,
     )
 
 

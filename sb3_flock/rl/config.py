@@ -51,6 +51,10 @@ class LearnerConfig(Settings):
     learning_starts: Count = Field(4_000, description="transitions flown with random actions before learning (open)")
     gamma: float = Field(0.96, ge=0, lt=1, description="discount factor (open)")
     tau: float = Field(0.005, gt=0, le=1, description="update rate of the target networks (open)")
+    guidance: NotNegative = Field(
+        0.0,
+        description="weight of the squared distance to the teacher's actions in the actor's loss; with ddpg alone (ours)",
+    )
     mirror: bool = Field(
         True,
         description="mirror half of every minibatch, left for right; not with ddpg-stock or n_steps > 1 (ours; paper: no)",
@@ -95,9 +99,11 @@ class PracticeConfig(Settings):
     separation_ratio: float = Field(
         1.06, ge=1, le=1e6, description="minimum separations, relative to the task's (ours; paper: 1)"
     )
-
-    teacher: Literal["orca", "olfati-saber"] | None = Field(
-        None, description="controller that flies some of the episodes for the policy to learn from; null: none (ours)"
+    obstacle_separation_ratio: float | None = Field(
+        None, ge=1, le=1e6, description="the same for obstacles; null: separation_ratio (ours; paper: 1)"
+    )
+    teacher: Literal["orca", "olfati-saber", "planner"] | None = Field(
+        None, description="who flies some of the episodes for the policy to learn from; planner: sees all; null: none (ours)"
     )
     teacher_share: float = Field(0.25, ge=0, le=1, description="share of the episodes that the teacher flies (ours)")
     teacher_noise: NotNegative = Field(
@@ -155,6 +161,13 @@ class TrainingConfig(Settings):
             raise ValueError(f"look_back = {self.scenario.look_back}: input should be a multiple of {step}")
         return self
 
+    @model_validator(mode="after")
+    def _guided_by_someone(self) -> TrainingConfig:
+        if self.learner.guidance and (self.practice.teacher is None or self.algo != "ddpg" or self.learner.n_steps > 1):
+            needed = "a practice.teacher, algo ddpg and n_steps 1"
+            raise ValueError(f"guidance = {self.learner.guidance}: input should be 0 without {needed}")
+        return self
+
     def flown_scenarios(self) -> list[Scenario]:
         """The scenarios flown side by side while training: ``scenario`` changed as ``practice`` says, one a size of flock."""
         scenario, practice = self.scenario, self.practice
@@ -165,6 +178,9 @@ class TrainingConfig(Settings):
             obstacle_arena=scenario.obstacle_half_side
             * (1.0 if scenario.obstacle_starts else practice.obstacle_arena_ratio),
             neighbor_separation=min(scenario.neighbor_separation * practice.separation_ratio, scenario.link_range),
-            obstacle_separation=min(scenario.obstacle_separation * practice.separation_ratio, scenario.detection_range),
+            obstacle_separation=min(
+                scenario.obstacle_separation * (practice.obstacle_separation_ratio or practice.separation_ratio),
+                scenario.detection_range,
+            ),
         )
         return [flown.replace(n_vehicles=vehicles) for vehicles in practice.vehicles or (scenario.n_vehicles,)]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch as th
 from stable_baselines3 import DDPG
@@ -18,8 +20,15 @@ class FlockDDPG(DDPG):
     The patches of a minibatch are gathered once for all networks that see it; the actor's step takes no gradient of the
     critic's weights, which nobody would use; the target networks follow in one operation; losses are read once a round.
 
-    The parameters are those of SB3's ``DDPG``. Every features extractor must be a :class:`FlockCNN`.
+    :param guidance: weight of the mean squared distance to the advised actions, of -1 to 1, in the actor's loss; if it is not
+        0, the replay buffer must hold advice
+
+    The other parameters are those of SB3's ``DDPG``. Every features extractor must be a :class:`FlockCNN`.
     """
+
+    def __init__(self, *args: Any, guidance: float = 0.0, **kwargs: Any) -> None:
+        self.guidance = guidance
+        super().__init__(*args, **kwargs)
 
     def _setup_model(self) -> None:
         super()._setup_model()
@@ -38,7 +47,7 @@ class FlockDDPG(DDPG):
         actor, critic = list(self.actor.parameters()), list(self.critic.parameters())
         targets = list(self.actor_target.parameters()) + list(self.critic_target.parameters())
         follow = get_ema_multi_avg_fn(1.0 - self.tau)  # type: ignore[no-untyped-call]
-        actor_losses, critic_losses = [], []
+        actor_losses, critic_losses, gaps = [], [], []
         for _ in range(gradient_steps):
             self._n_updates += 1
             batch = self.replay_buffer.sample(batch_size)  # type: ignore[union-attr]
@@ -54,7 +63,12 @@ class FlockDDPG(DDPG):
             critic_loss = th.stack([F.mse_loss(value, target_values) for value in values]).sum()
             _step(self.critic.optimizer, critic_loss, critic)
 
-            actor_loss = -self.critic.q1_forward(observations, self.actor(observations)).mean()
+            actions = self.actor(observations)
+            actor_loss = -self.critic.q1_forward(observations, actions).mean()
+            if self.guidance:
+                gap = F.mse_loss(actions, batch.advice)  # type: ignore[union-attr]
+                actor_loss = actor_loss + self.guidance * gap
+                gaps.append(gap.detach())
             _step(self.actor.optimizer, actor_loss, actor)
 
             follow(targets, actor + critic, None)
@@ -64,6 +78,8 @@ class FlockDDPG(DDPG):
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self.logger.record("train/actor_loss", np.mean(th.stack(actor_losses).tolist()))
         self.logger.record("train/critic_loss", np.mean(th.stack(critic_losses).tolist()))
+        if gaps:
+            self.logger.record("train/advice_gap", np.mean(th.stack(gaps).tolist()))
 
 
 def _step(optimizer: th.optim.Optimizer, loss: th.Tensor, parameters: list[th.nn.Parameter]) -> None:

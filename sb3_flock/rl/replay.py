@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
@@ -12,6 +12,19 @@ from numpy.typing import NDArray
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
+
+
+class AdvisedSamples(NamedTuple):
+    """A minibatch as SB3's ``ReplayBufferSamples``, with what a teacher would have done."""
+
+    observations: th.Tensor
+    actions: th.Tensor
+    next_observations: th.Tensor
+    dones: th.Tensor
+    rewards: th.Tensor
+    discounts: th.Tensor | None
+    advice: th.Tensor
+    """``(batch, 2)``, scaled as the actions: -1 to 1."""
 
 
 class CompactReplayBuffer(ReplayBuffer):
@@ -24,6 +37,8 @@ class CompactReplayBuffer(ReplayBuffer):
     :param buffer_size: transitions at most
     :param observation_space: a ``Box`` of floats
     :param mirror: return half of every sample as in a mirror, left for right: as true to the task as the transition flown
+    :param advice: keep each info's ``advice``, too, the action ``(2,)`` that a teacher would have chosen; samples are then
+        :class:`AdvisedSamples`
 
     The other parameters are those of SB3's ``ReplayBuffer``.
     """
@@ -38,6 +53,7 @@ class CompactReplayBuffer(ReplayBuffer):
         optimize_memory_usage: bool = False,
         handle_timeout_termination: bool = True,
         mirror: bool = False,
+        advice: bool = False,
     ) -> None:
         half = spaces.Box(-1.0, 1.0, observation_space.shape, np.float16)  # only its shape and type count
         # One row more than asked for: the row after the newest holds its next observation, and is not sampled.
@@ -53,6 +69,7 @@ class CompactReplayBuffer(ReplayBuffer):
         self.observation_space = observation_space
         self.handle_timeout_termination = handle_timeout_termination
         self.mirror = mirror
+        self.advice = np.zeros_like(self.actions) if advice else None
         self._last_observations: dict[int, dict[int, NDArray[np.float16]]] = {}
 
     def add(
@@ -70,9 +87,14 @@ class CompactReplayBuffer(ReplayBuffer):
             self._last_observations[self.pos] = {
                 env: next_obs[env].astype(np.float16) for env in np.flatnonzero(done).tolist()
             }
+        if self.advice is not None:
+            low, high = self.action_space.low, self.action_space.high  # type: ignore[attr-defined]
+            self.advice[self.pos] = 2 * (np.array([info["advice"] for info in infos]) - low) / (high - low) - 1
         super().add(obs, next_obs, action, reward, done, infos)
 
-    def _get_samples(self, batch_inds: NDArray[np.int64], env: VecNormalize | None = None) -> ReplayBufferSamples:
+    def _get_samples(  # type: ignore[override]
+        self, batch_inds: NDArray[np.int64], env: VecNormalize | None = None
+    ) -> ReplayBufferSamples | AdvisedSamples:
         env_indices = np.random.randint(0, high=self.n_envs, size=(len(batch_inds),))  # noqa: NPY002 - as SB3 draws them
         at = (batch_inds, env_indices)
         next_observations = self.observations[(batch_inds + 1) % self.buffer_size, env_indices]
@@ -84,13 +106,19 @@ class CompactReplayBuffer(ReplayBuffer):
             for tensors in (observations, next_observations):
                 tensors[:half] = tensors[:half, ..., ::-1].copy()
             actions[:half, 1] *= -1
-        return ReplayBufferSamples(
+        samples = ReplayBufferSamples(
             self._to_float(observations),
             self.to_torch(actions, copy=False),
             self._to_float(next_observations),
             self.to_torch((dones * (1 - self.timeouts[at]))[:, None], copy=False),
             self.to_torch(self.rewards[at][:, None], copy=False),
         )
+        if self.advice is None:
+            return samples
+        advice = self.advice[at]
+        if self.mirror:
+            advice[:half, 1] *= -1
+        return AdvisedSamples(*samples, self.to_torch(advice, copy=False))
 
     def _to_float(self, observations: NDArray[np.float16]) -> th.Tensor:
         return self.to_torch(observations, copy=False).float()

@@ -176,7 +176,10 @@ def _flock(config: TrainingConfig, flown: Scenario) -> parallel_env:
     practice = config.practice
     if practice.teacher is None:
         return parallel_env(flown)
-    return DemonstratedEnv(flown, TEACHERS[practice.teacher](), practice.teacher_share, practice.teacher_noise)
+    teacher = TEACHERS[practice.teacher]
+    return DemonstratedEnv(
+        flown, teacher, practice.teacher_share, practice.teacher_noise, advises=config.learner.guidance > 0
+    )
 
 
 def _run(

@@ -100,6 +100,11 @@ class World:
             self._frames = _directions(self._headings)
         return self._frames
 
+    @property
+    def waypoint_velocities(self) -> NDArray[np.float64]:
+        """``(flocks, 2)`` [m/s], over the next step."""
+        return (self._next_waypoints() - self.waypoints) / self.scenario.time_step
+
     def reset(self, rngs: Sequence[Generator]) -> Sensing:
         """Start an episode in every flock (section V).
 
@@ -140,8 +145,8 @@ class World:
         self.positions = _moved(self.positions, self.frames, clipped[..., 0], dt)
         self.headings = wrap_angle(self.headings + clipped[..., 1] * dt)
         self._move_obstacles(dt)
+        self.waypoints = self._next_waypoints()
         self.steps += 1
-        self._move_waypoints(scenario.waypoint_speed * dt)
         return sense(self, clipped * dt), clipped
 
     def state_dict(self) -> dict[str, Any]:
@@ -175,14 +180,13 @@ class World:
         self.steps = int(state["steps"])
         self.sensors.load_state_dict(state["sensors"])
 
-    def _move_waypoints(self, stride: float) -> None:
+    def _next_waypoints(self) -> NDArray[np.float64]:
         """Straight towards the origin (section V), or along the route."""
-        route = self.scenario.waypoint_route
+        route, stride = self.scenario.waypoint_route, self.scenario.waypoint_speed * self.scenario.time_step
         if route is not None:
-            self.waypoints = np.broadcast_to(along(np.array(route), stride * self.steps), self.waypoints.shape).copy()
-            return
+            return np.broadcast_to(along(np.array(route), stride * (self.steps + 1)), self.waypoints.shape).copy()
         distance = np.sqrt(np.square(self.waypoints).sum(-1, keepdims=True))
-        self.waypoints = self.waypoints * (1.0 - np.minimum(stride / np.maximum(distance, stride or 1.0), 1.0))
+        return self.waypoints * (1.0 - np.minimum(stride / np.maximum(distance, stride or 1.0), 1.0))
 
     def _move_obstacles(self, dt: float) -> None:
         """Unicycles with drawn speeds and turn rates, turned back at the edge of their square."""

@@ -6,9 +6,9 @@ from sb3_flock import train
 from sb3_flock.envs.demonstrations import DemonstratedEnv
 from sb3_flock.envs.flocking_v0 import parallel_env
 from sb3_flock.envs.vec_env import flatten
-from sb3_flock.evaluation.controllers import make_controller
+from sb3_flock.evaluation.controllers import TEACHERS, make_controller
 from sb3_flock.settings import SettingsError
-from sb3_flock.sim import Scenario
+from sb3_flock.sim import Scenario, World
 from tests.rl.test_training import quiet, tiny
 
 CROWD = Scenario(n_vehicles=4, n_obstacles=2, arena=0.3, obstacle_arena=0.4, max_cycles=10)
@@ -25,7 +25,7 @@ def fly(env, actions=None):
 
 
 def test_the_teacher_flies_as_it_does_alone_and_the_infos_tell_how():
-    env = DemonstratedEnv(CROWD, make_controller("orca"), share=1.0, noise=0.0)
+    env = DemonstratedEnv(CROWD, TEACHERS["orca"], share=1.0, noise=0.0)
     env.reset(seed=1)
     positions, flown = fly(env)
     alone = parallel_env(CROWD)
@@ -43,7 +43,7 @@ def test_the_teacher_flies_as_it_does_alone_and_the_infos_tell_how():
 
 
 def test_it_flies_its_share_of_the_episodes_with_its_noise():
-    env = DemonstratedEnv(CROWD, make_controller("olfati-saber"), share=0.3, noise=0.5)
+    env = DemonstratedEnv(CROWD, TEACHERS["olfati-saber"], share=0.3, noise=0.5)
     env.reset(seed=0)
     taught = []
     for _ in range(200):
@@ -60,9 +60,31 @@ def test_it_flies_its_share_of_the_episodes_with_its_noise():
     assert actions.std(axis=0).min() > 0.01
 
 
+def test_an_adviser_says_in_every_step_what_it_would_do_there():
+    env = DemonstratedEnv(CROWD, TEACHERS["planner"], share=0.5, noise=0.1, advises=True)
+    rng = np.random.default_rng(0)
+    kinds = set()
+    for seed in range(5, 10):
+        env.reset(seed=seed)
+        world = World(CROWD)
+        teacher = TEACHERS["planner"](world)
+        for _ in range(CROWD.max_cycles):
+            world.load_state_dict(env.world.state_dict())
+            teacher.load_state_dict(env.state_dict()["taught"]["memory"])
+            advice = env.state_dict()["taught"]["advice"]
+            actions = rng.uniform(env.world.action_low, env.world.action_high, (4, 2)).astype(np.float32)
+            *_, infos = env.step(dict(zip(env.agents, actions, strict=True)))
+            np.testing.assert_array_equal([info["advice"] for info in infos.values()], advice)
+            kinds.add("action" in infos["vehicle_0"])
+            flown = [info.get("action", action) for info, action in zip(infos.values(), actions, strict=True)]
+            sensing, _ = world.step([flown])
+            np.testing.assert_array_equal(teacher.act(sensing, CROWD)[0], env.state_dict()["taught"]["advice"])
+    assert kinds == {True, False}
+
+
 @pytest.mark.parametrize("num_cpus", [0, 2])
 def test_flattened_flocks_tell_what_was_flown(num_cpus):
-    env = flatten(DemonstratedEnv(CROWD, make_controller("orca"), 0.5, 0.1), n_copies=6, num_cpus=num_cpus, seed=0)
+    env = flatten(DemonstratedEnv(CROWD, TEACHERS["orca"], 0.5, 0.1), n_copies=6, num_cpus=num_cpus, seed=0)
     try:
         env.reset()
         *_, infos = env.step(np.zeros((24, 2), np.float32))
@@ -107,3 +129,7 @@ def test_mistakes_are_one_line(tmp_path):
     for name, value in (("teacher", "random"), ("teacher_share", 1.1), ("teacher_noise", -0.1)):
         with pytest.raises(SettingsError, match=f"{name} = "):
             tiny(tmp_path, **{f"practice.{name}": value})
+    needed = r"guidance = 0.5: input should be 0 without a practice.teacher, algo ddpg and n_steps 1"
+    for changes in ({}, {"teacher": "orca", "algo": "td3"}, {"teacher": "orca", "n_steps": 3}):
+        with pytest.raises(SettingsError, match=needed):
+            tiny(tmp_path, guidance=0.5, **changes)

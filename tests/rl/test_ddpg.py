@@ -5,7 +5,7 @@ from stable_baselines3 import DDPG
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.torch_layers import FlattenExtractor
 
-from sb3_flock import FlockCNN, FlockDDPG, FlockPolicy, make_vec_env
+from sb3_flock import CompactReplayBuffer, FlockCNN, FlockDDPG, FlockPolicy, make_vec_env
 from sb3_flock.settings import SettingsError
 
 
@@ -59,6 +59,29 @@ def test_fifty_updates_end_where_stock_ddpg_with_plain_convolutions_ends(n_criti
         th.testing.assert_close(ours, theirs, rtol=1e-3, atol=1e-5, msg=lambda text, name=name: f"{name}: {text}")
     for name in ("train/actor_loss", "train/critic_loss"):
         assert lean.logger.name_to_value[name] == pytest.approx(stock.logger.name_to_value[name], rel=1e-3)
+
+
+@pytest.mark.parametrize("guidance", [0.0, 30.0])
+def test_guidance_draws_the_actor_to_what_is_advised(guidance):
+    lean, rng = model(FlockDDPG, FlockCNN, True), np.random.default_rng(0)
+    lean.guidance, advised = guidance, np.array([0.5, -0.25])
+    envs, shape = lean.n_envs, lean.observation_space.shape
+    lean.replay_buffer = CompactReplayBuffer(1200, lean.observation_space, lean.action_space, "cpu", envs, advice=True)
+    for _ in range(100):
+        tensors, actions = rng.random((2, envs, *shape)), rng.uniform(-1, 1, (envs, 2))
+        infos = [{"advice": lean.policy.unscale_action(advised)}] * envs
+        lean.replay_buffer.add(*tensors, actions, rng.normal(size=envs), np.zeros(envs, bool), infos)
+    lean._update_current_progress_remaining(0, 1)
+    lean.train(200, 64)
+    observations = lean.replay_buffer.sample(200).observations
+    actions = lean.actor(observations).detach().numpy()
+    gap = np.square(actions - advised).mean()
+    if guidance:
+        assert gap < 0.01
+        assert lean.logger.name_to_value["train/advice_gap"] < 0.1
+    else:
+        assert gap > 0.1
+        assert "train/advice_gap" not in lean.logger.name_to_value
 
 
 def test_another_extractor_is_refused_in_one_line():

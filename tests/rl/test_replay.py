@@ -45,6 +45,20 @@ def test_it_returns_what_sb3s_buffer_returns_but_for_the_last_digits(steps):
         assert getattr(ours, name).dtype == th.float32
 
 
+@pytest.mark.parametrize("mirror", [False, True])
+def test_advice_comes_with_its_transition_scaled_and_mirrored_as_the_action_is(mirror):
+    buffer = CompactReplayBuffer(80, *SPACES, device="cpu", n_envs=N_ENVS, mirror=mirror, advice=True)
+    space, rng = SPACES[1], np.random.default_rng(0)
+    tensors = np.zeros((N_ENVS, *SPACES[0].shape), np.float32)
+    for _ in range(33):
+        actions = rng.uniform(-1, 1, (N_ENVS, 2)).astype(np.float32)
+        infos = [{"advice": space.low + (action + 1) / 2 * (space.high - space.low)} for action in actions]
+        buffer.add(tensors, tensors, actions, np.zeros(N_ENVS), np.zeros(N_ENVS, bool), infos)
+    batch = samples(buffer)
+    th.testing.assert_close(batch.advice, batch.actions, rtol=0, atol=1e-6)
+    assert len(batch.advice.unique(dim=0)) > 50
+
+
 def test_once_full_it_holds_the_newest_transitions_and_the_right_next_observations():
     compact, everything = (
         CompactReplayBuffer(80, *SPACES, device="cpu", n_envs=N_ENVS),

@@ -33,6 +33,17 @@ def test_the_waypoint_heads_for_the_origin_and_stays_there(scenario, place):
     assert np.isfinite(world.waypoints).all()
 
 
+@pytest.mark.parametrize("route", [None, [(0.0, 0.0), (0.25, 0.0), (0.25, 1.0)]])
+def test_the_waypoints_velocity_is_that_of_its_next_step(scenario, route):
+    world = World(scenario.replace(waypoint_route=route), 3)
+    world.reset([np.random.default_rng(seed) for seed in range(3)])
+    for _ in range(40):
+        before, velocities = world.waypoints, world.waypoint_velocities
+        world.step(np.zeros((3, scenario.n_vehicles, 2)))
+        np.testing.assert_allclose(world.waypoints - before, velocities * scenario.time_step, atol=1e-12)
+    assert np.hypot(*velocities.T).max() == pytest.approx(scenario.waypoint_speed)
+
+
 def test_a_waypoint_on_the_origin_or_without_speed_stays(scenario, place):
     world = place(scenario.replace(waypoint_speed=0.0), [(0.5, 0.5)], [0.0], waypoint=(0.3, 0.4))
     world.step(np.zeros((1, 1, 2)))

@@ -2,20 +2,42 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from sb3_flock.envs.demonstrations import Teacher
 from sb3_flock.evaluation.controllers.olfati_saber import OlfatiSaber
 from sb3_flock.evaluation.controllers.orca import Orca
+from sb3_flock.evaluation.controllers.planner import Planner
 from sb3_flock.evaluation.controllers.simple import GoToWaypoint, RandomController
 from sb3_flock.evaluation.episodes import Controller
 from sb3_flock.settings import SettingsError
+from sb3_flock.sim import World
 
-TEACHERS: dict[str, type[Teacher]] = {"olfati-saber": OlfatiSaber, "orca": Orca}
-"""Those that can fly for a policy to learn from, by name."""
-
-CONTROLLERS: dict[str, type[Controller]] = {"random": RandomController, "go-to-waypoint": GoToWaypoint, **TEACHERS}
+CONTROLLERS: dict[str, type[Controller]] = {
+    "random": RandomController,
+    "go-to-waypoint": GoToWaypoint,
+    "olfati-saber": OlfatiSaber,
+    "orca": Orca,
+}
 """The controllers by name."""
 
-__all__ = ["CONTROLLERS", "TEACHERS", "GoToWaypoint", "OlfatiSaber", "Orca", "RandomController", "make_controller"]
+TEACHERS: dict[str, Callable[[World], Teacher]] = {
+    "olfati-saber": lambda world: OlfatiSaber(),
+    "orca": lambda world: Orca(),
+    "planner": Planner,
+}
+"""Who can fly and advise for a policy to learn from, by name. A teacher may see the whole world, a controller may not."""
+
+__all__ = [
+    "CONTROLLERS",
+    "TEACHERS",
+    "GoToWaypoint",
+    "OlfatiSaber",
+    "Orca",
+    "Planner",
+    "RandomController",
+    "make_controller",
+]
 
 
 def make_controller(name: str) -> Controller:

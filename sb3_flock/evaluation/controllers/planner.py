@@ -1,0 +1,144 @@
+"""A planner that sees everything, to teach a policy that sees little."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from sb3_flock.evaluation.controllers.motion import rotate, steer
+from sb3_flock.evaluation.controllers.orca import Orca, OrcaGains
+from sb3_flock.settings import SettingsError
+from sb3_flock.sim import Scenario, Sensing, World
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PlannerGains:
+    """What is free in the planner."""
+
+    spacing: float = 1.04
+    """Distance between neighboring places, relative to the minimum separation to neighbors."""
+    clearance: float = 1.03
+    """Distance of places from obstacles, relative to the minimum separation to them."""
+    way: float = 0.2
+    """Weight of the vehicles' mean way to their places, beside the places' mean distance to the waypoint."""
+    tolerance: float = 0.005
+    """Distance to its place at which a vehicle stops [m]."""
+    calm: float = 0.015
+    """Speed below which vehicles turn in proportion to it [m/s]: at rest a wish is too small for its direction to matter."""
+
+
+class Planner:
+    """Gives each vehicle a place of its own around the waypoint, and lets :class:`Orca` fly them there.
+
+    The places are a connected part of a hexagonal lattice, free of obstacles: of many lattices, turned and shifted, the one
+    where the vehicles stand nearest to the waypoint and have the shortest ways. It knows where everything is, so it is
+    no peer of a policy that flies by what one vehicle senses; how much nearer its flocks stand is what full sight is worth.
+
+    :param world: the world that it sees, whatever is sensed in it
+    :param gains: found by a few trials
+    :raises SettingsError: if ``pyrvo`` or ``scipy`` is not installed
+    """
+
+    def __init__(self, world: World, gains: PlannerGains | None = None) -> None:
+        self.world, self.gains = world, gains or PlannerGains()
+        self.orca = Orca(OrcaGains(margin=0.002))
+        try:
+            from scipy.optimize import linear_sum_assignment
+        except ImportError:
+            raise SettingsError("teacher = 'planner': needs scipy, pip install 'sb3_flock[orca]'") from None
+        self._assign = linear_sum_assignment
+        self.packs = Packs(world.scenario.n_vehicles, self.gains.spacing * world.scenario.neighbor_separation)
+
+    def reset(self, rngs: Sequence[Generator], scenario: Scenario) -> None:
+        """Forget the last episode."""
+        self.orca.reset(rngs, scenario)
+
+    def act(self, sensing: Sensing, scenario: Scenario) -> Array:
+        """The actions that fly ORCA's velocities towards the places, as fast as these move besides."""
+        world, gains = self.world, self.gains
+        places = world.waypoints[:, None] + np.stack([self._places(flock) for flock in range(world.n_flocks)])
+        offsets = places + world.waypoint_velocities[:, None] / self.orca.gains.approach - world.positions
+        distances = np.hypot(offsets[..., 0], offsets[..., 1])[..., None]
+        offsets = offsets * np.maximum(0.0, 1.0 - gains.tolerance / np.maximum(distances, 1e-9))
+        goals = rotate(offsets, -world.headings)
+        velocities = self.orca.velocities(replace(sensing, waypoint_positions=goals), scenario)
+        actions = steer(velocities, scenario)
+        actions[..., 1] *= np.minimum(1.0, np.hypot(velocities[..., 0], velocities[..., 1]) / gains.calm)
+        return actions
+
+    def state_dict(self) -> dict[str, Any]:
+        """What is remembered of the episodes under way: plain values and arrays."""
+        return self.orca.state_dict()
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from :meth:`state_dict`."""
+        self.orca.load_state_dict(state)
+
+    def _places(self, flock: int) -> Array:
+        """A place for each vehicle ``(vehicles, 2)``, seen from the waypoint."""
+        world, gains = self.world, self.gains
+        obstacles = world.obstacle_positions[flock] - world.waypoints[flock]
+        packs, costs = self.packs.free(obstacles, gains.clearance * world.scenario.obstacle_separation)
+        ways = np.linalg.norm((world.positions[flock] - world.waypoints[flock])[:, None] - packs[:, None], axis=-1)
+        chosen = [self._assign(way) for way in ways]
+        costs = costs + gains.way * np.array([way[pairs].mean() for way, pairs in zip(ways, chosen, strict=True)])
+        best = int(np.argmin(costs))
+        return packs[best][chosen[best][1]]
+
+
+class Packs:
+    """Packs of vehicles around the origin, cut from lattices of many angles and offsets, some leaning to one side.
+
+    :param n_vehicles: vehicles in a pack
+    :param spacing: between neighbors of the lattice [m]
+    :param lattices: number of lattices
+    """
+
+    def __init__(self, n_vehicles: int, spacing: float, lattices: int = 24) -> None:
+        rng = np.random.default_rng(0)
+        reach = int(np.ceil(np.sqrt(n_vehicles))) + 3
+        side = np.arange(-reach, reach + 1)
+        grid = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2) @ np.array([[1.0, 0.0], [0.5, np.sqrt(0.75)]])
+        grid = grid[np.argsort(np.linalg.norm(grid, axis=-1), kind="stable")][: 3 * n_vehicles + 25]
+        angles, offsets = rng.uniform(0, np.pi / 3, (lattices, 1)), rng.uniform(-0.5, 0.5, (lattices, 1, 2))
+        self.n_vehicles, self.spacing = n_vehicles, spacing
+        self.places = spacing * rotate(grid + offsets, np.broadcast_to(angles, (lattices, len(grid))))
+        self.distances = np.linalg.norm(self.places, axis=-1)
+        leanings = [lean * np.array([np.cos(a), np.sin(a)]) for lean in (0.3, 0.8) for a in np.arange(8) * np.pi / 4]
+        self._orders = np.stack([self.distances - self.places @ lean for lean in [np.zeros(2), *leanings]], axis=1)
+
+    def free(self, obstacles: Array, clearance: float, most: int = 20) -> tuple[Array, Array]:
+        """The packs nearest to the origin, connected ones if there are any, with no place within ``clearance`` of an obstacle.
+
+        :param obstacles: ``(any, 2)`` [m]
+        :param clearance: distance to keep from obstacles [m]
+        :param most: number of packs at most
+        :return: the packs ``(packs, vehicles, 2)`` and their mean distances ``(packs,)``, both in meters
+        """
+        n = self.n_vehicles
+        away = np.linalg.norm(self.places[..., None, :] - obstacles, axis=-1).min(-1, initial=np.inf)
+        # Only what an obstacle cuts into needs packs that lean away from it.
+        orders = self._orders if away.min() < clearance else self._orders[:, :1]
+        orders = np.where((away >= clearance)[:, None], orders, np.inf)
+        chosen = np.argpartition(orders, n - 1, axis=-1)[..., :n].reshape(-1, n)
+        lattice = np.repeat(np.arange(len(self.places)), orders.shape[1])[:, None]
+        packs, distances = self.places[lattice, chosen], self.distances[lattice, chosen].mean(1)
+        nearest = np.argsort(distances, kind="stable")[: 3 * most]
+        packs, distances = packs[nearest], distances[nearest]
+        whole = self._connected(packs)
+        if whole.any():
+            packs, distances = packs[whole], distances[whole]
+        return packs[:most], distances[:most]
+
+    def _connected(self, packs: Array) -> NDArray[np.bool_]:
+        reached = (np.linalg.norm(packs[:, :, None] - packs[:, None], axis=-1) < 1.01 * self.spacing).astype(np.float32)
+        for _ in range(self.n_vehicles.bit_length()):
+            reached = np.minimum(reached @ reached, 1.0)
+        return reached.all(axis=(1, 2))
