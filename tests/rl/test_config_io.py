@@ -87,6 +87,8 @@ def test_practice_is_harder_than_the_task_and_scales_with_it():
     flown = config.flown_scenarios()[0]
     assert (flown.n_obstacles, flown.obstacle_arena, flown.neighbor_separation) == (4, 20.0, 2.04)
     assert flown.obstacle_separation == pytest.approx(3.3)
+    apart = config.replace(practice=config.practice.replace(obstacle_separation_ratio=1.5)).flown_scenarios()[0]
+    assert (apart.neighbor_separation, apart.obstacle_separation) == (2.04, 4.5)
     assert config.scenario.n_obstacles == 1
     none = load_config(TrainingConfig, overrides={"n_obstacles": 0, "extra_obstacles": 3})
     assert none.flown_scenarios()[0].n_obstacles == 0
