@@ -40,7 +40,8 @@ class DemonstratedEnv(parallel_env):
     :param teacher: makes the one who flies; it is given the world, to see more than vehicles do
     :param share: probability that an episode is the teacher's, in [0, 1]
     :param noise: standard deviation of the noise on the teacher's actions [half the action range]
-    :param advises: also say in every step, whoever flies, what the teacher would do: each agent's info has it as ``advice``
+    :param advises: also say in every step, whoever flies, what the teacher would do: each agent's info has it as ``advice``,
+        as ``action`` an array ``(2,)`` [m/s, rad/s]
     """
 
     def __init__(
@@ -75,7 +76,8 @@ class DemonstratedEnv(parallel_env):
         super().load_state_dict(state)
         self._advice = self._planned = None
         if state["taught"] is not None:
-            self._advice, self._planned = state["taught"]["advice"], state["taught"]["planned"]
+            self._planned = state["taught"]["planned"]
+            self._advice = state["taught"].get("advice", self._planned)  # checkpoints without it are of teachers that flew
             self.teacher.load_state_dict(state["taught"]["memory"])
 
     def _measure(self, sensing: Sensing) -> Sensing:

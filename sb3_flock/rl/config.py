@@ -53,7 +53,7 @@ class LearnerConfig(Settings):
     tau: float = Field(0.005, gt=0, le=1, description="update rate of the target networks (open)")
     guidance: NotNegative = Field(
         0.0,
-        description="weight of the squared distance to the teacher's actions in the actor's loss; with ddpg alone (ours)",
+        description="weight of the mean squared difference to the teacher's actions in the actor's loss; ddpg alone (ours)",
     )
     mirror: bool = Field(
         True,
@@ -163,8 +163,9 @@ class TrainingConfig(Settings):
 
     @model_validator(mode="after")
     def _guided_by_someone(self) -> TrainingConfig:
-        if self.learner.guidance and (self.practice.teacher is None or self.algo != "ddpg" or self.learner.n_steps > 1):
-            needed = "a practice.teacher, algo ddpg and n_steps 1"
+        advises = self.practice.teacher in ("orca", "planner")  # Olfati-Saber's law knows its velocity only where it flies
+        if self.learner.guidance and not (advises and self.algo == "ddpg" and self.learner.n_steps == 1):
+            needed = "practice.teacher orca or planner, algo ddpg and n_steps 1"
             raise ValueError(f"guidance = {self.learner.guidance}: input should be 0 without {needed}")
         return self
 

@@ -13,6 +13,8 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_flock.settings import SettingsError
+
 
 class AdvisedSamples(NamedTuple):
     """A minibatch as SB3's ``ReplayBufferSamples``, with what a teacher would have done."""
@@ -37,8 +39,8 @@ class CompactReplayBuffer(ReplayBuffer):
     :param buffer_size: transitions at most
     :param observation_space: a ``Box`` of floats
     :param mirror: return half of every sample as in a mirror, left for right: as true to the task as the transition flown
-    :param advice: keep each info's ``advice``, too, the action ``(2,)`` that a teacher would have chosen; samples are then
-        :class:`AdvisedSamples`
+    :param advice: keep each info's ``advice``, too, the action ``(2,)`` [m/s, rad/s] that a teacher would have chosen; samples
+        are then :class:`AdvisedSamples`
 
     The other parameters are those of SB3's ``ReplayBuffer``.
     """
@@ -88,6 +90,10 @@ class CompactReplayBuffer(ReplayBuffer):
                 env: next_obs[env].astype(np.float16) for env in np.flatnonzero(done).tolist()
             }
         if self.advice is not None:
+            if not all("advice" in info for info in infos):
+                raise SettingsError(
+                    "advice = True: only a DemonstratedEnv that advises gives it; load with guidance 0, without it"
+                )
             low, high = self.action_space.low, self.action_space.high  # type: ignore[attr-defined]
             self.advice[self.pos] = 2 * (np.array([info["advice"] for info in infos]) - low) / (high - low) - 1
         super().add(obs, next_obs, action, reward, done, infos)

@@ -119,7 +119,7 @@ def bound(episodes: int) -> float:
         world.step(np.zeros((episodes, 5, 2)))
         if 2 * step > CROSSING.max_cycles and step % 10 == 0:
             for obstacles in world.obstacle_positions - world.waypoints[:, None]:
-                least.append(packs.free(obstacles, CROSSING.obstacle_separation, most=200)[1].min())
+                least.append(packs.free(obstacles, CROSSING.obstacle_separation, most=10_000)[1].min())
     return float(np.mean(least))
 
 

@@ -2,9 +2,10 @@ import numpy as np
 import pytest
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_flock import train
+from sb3_flock import FlockDDPG, make_vec_env, train
 from sb3_flock.envs.demonstrations import DemonstratedEnv
 from sb3_flock.envs.flocking_v0 import parallel_env
+from sb3_flock.envs.side_by_side import SideBySide
 from sb3_flock.envs.vec_env import flatten
 from sb3_flock.evaluation.controllers import TEACHERS, make_controller
 from sb3_flock.settings import SettingsError
@@ -100,36 +101,60 @@ def test_flattened_flocks_tell_what_was_flown(num_cpus):
         env.close()
 
 
+@pytest.mark.parametrize("num_cpus", [0, 2])
+def test_each_copy_is_advised_of_its_own_world(num_cpus):
+    pair = SideBySide([DemonstratedEnv(CROWD, TEACHERS["planner"], 0.0, 0.0, advises=True) for _ in range(2)])
+    env = flatten(pair, n_copies=2, num_cpus=num_cpus, seed=0)
+    try:
+        env.reset()
+        for _ in range(12):  # over the end of an episode
+            *_, infos = env.step(np.zeros((16, 2), np.float32))
+        advice = np.array([info["advice"] for info in infos]).reshape(4, 4, 2)
+        assert not any("action" in info for info in infos)
+        assert len(np.unique(advice.reshape(4, -1), axis=0)) == 4
+        if num_cpus == 0:
+            flocks = [flock for copy in env._copies(range(0, 16, 8)) for flock in copy.unwrapped.flocks]
+            assert all(flock.teacher.world is flock.world for flock in flocks)
+    finally:
+        env.close()
+
+
 class Record(BaseCallback):
     """Keeps what each step flew: the teacher's action or, by SB3's rollout, the policy's."""
 
     def __init__(self):
         super().__init__()
-        self.taught, self.actions = [], []
+        self.taught, self.actions, self.advice = [], [], []
 
     def _on_step(self):
         infos, given = self.locals["infos"], self.locals["actions"]
         self.taught.append(["action" in info for info in infos])
         self.actions.append([info.get("action", action) for info, action in zip(infos, given, strict=True)])
+        self.advice.append([info.get("advice", (0, 0)) for info in infos])
         return True
 
 
 def test_the_replay_buffer_takes_what_was_flown(tmp_path):
     record = Record()
-    changes = {"practice.teacher": "orca", "practice.teacher_share": 0.5, "n_flocks": 6, "learning_starts": 100}
+    changes = {"teacher": "planner", "teacher_share": 0.5, "guidance": 1.0, "n_flocks": 6, "learning_starts": 100}
     model = train(tiny(tmp_path, total_timesteps=540, **changes), quiet(), callbacks=[record]).model
     taught = np.array(record.taught)
     assert 0.2 < taught.mean() < 0.8
     buffer = model.replay_buffer
     stored = model.policy.unscale_action(buffer.actions[: buffer.pos])
     np.testing.assert_allclose(stored, record.actions, atol=1e-6)
+    advised = model.policy.unscale_action(buffer.advice[: buffer.pos])
+    np.testing.assert_allclose(advised, record.advice, atol=1e-6)
+    model.save(tmp_path / "guided.zip")
+    with pytest.raises(SettingsError, match="advice = True: only a DemonstratedEnv that advises gives it"):
+        FlockDDPG.load(tmp_path / "guided.zip", env=make_vec_env(Scenario(), n_flocks=6), device="cpu").learn(400)
 
 
 def test_mistakes_are_one_line(tmp_path):
     for name, value in (("teacher", "random"), ("teacher_share", 1.1), ("teacher_noise", -0.1)):
         with pytest.raises(SettingsError, match=f"{name} = "):
             tiny(tmp_path, **{f"practice.{name}": value})
-    needed = r"guidance = 0.5: input should be 0 without a practice.teacher, algo ddpg and n_steps 1"
-    for changes in ({}, {"teacher": "orca", "algo": "td3"}, {"teacher": "orca", "n_steps": 3}):
+    needed = "guidance = 0.5: input should be 0 without practice.teacher orca or planner, algo ddpg and n_steps 1"
+    for changes in ({}, {"teacher": "olfati-saber"}, {"teacher": "orca", "algo": "td3"}, {"teacher": "orca", "n_steps": 3}):
         with pytest.raises(SettingsError, match=needed):
             tiny(tmp_path, guidance=0.5, **changes)

@@ -84,6 +84,11 @@ def test_guidance_draws_the_actor_to_what_is_advised(guidance):
         assert "train/advice_gap" not in lean.logger.name_to_value
 
 
+def test_guidance_without_advice_is_refused_in_one_line():
+    with pytest.raises(SettingsError, match="guidance = 2.0: needs a CompactReplayBuffer with advice=True, or be 0"):
+        FlockDDPG(FlockPolicy, make_vec_env(n_flocks=1), guidance=2.0, device="cpu")
+
+
 def test_another_extractor_is_refused_in_one_line():
     with pytest.raises(SettingsError, match="features_extractor_class = FlattenExtractor: FlockDDPG needs FlockCNN"):
         FlockDDPG(

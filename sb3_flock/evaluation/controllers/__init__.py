@@ -1,4 +1,4 @@
-"""Hand-written controllers behind the interface of a policy: ``evaluate(make_controller("orca"), scenario)``."""
+"""Hand-written controllers behind the interface of a policy, ``evaluate(make_controller("orca"), scenario)``, and teachers."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ class PlannerGains:
     way: float = 0.2
     """Weight of the vehicles' mean way to their places, beside the places' mean distance to the waypoint."""
     tolerance: float = 0.005
-    """Distance to its place at which a vehicle stops [m]."""
+    """Distance that a vehicle keeps from its place, at rest and behind a moving one [m]."""
     calm: float = 0.015
     """Speed below which vehicles turn in proportion to it [m/s]: at rest a wish is too small for its direction to matter."""
 
@@ -38,8 +38,8 @@ class Planner:
     """Gives each vehicle a place of its own around the waypoint, and lets :class:`Orca` fly them there.
 
     The places are a connected part of a hexagonal lattice, free of obstacles: of many lattices, turned and shifted, the one
-    where the vehicles stand nearest to the waypoint and have the shortest ways. It knows where everything is, so it is
-    no peer of a policy that flies by what one vehicle senses; how much nearer its flocks stand is what full sight is worth.
+    where the vehicles stand nearest to the waypoint and have the shortest ways. Places are given by where everything is, so it
+    is no peer of a policy that flies by what one vehicle senses; on its way a vehicle minds what it senses itself.
 
     :param world: the world that it sees, whatever is sensed in it
     :param gains: found by a few trials
@@ -115,7 +115,9 @@ class Packs:
         self._orders = np.stack([self.distances - self.places @ lean for lean in [np.zeros(2), *leanings]], axis=1)
 
     def free(self, obstacles: Array, clearance: float, most: int = 20) -> tuple[Array, Array]:
-        """The packs nearest to the origin, connected ones if there are any, with no place within ``clearance`` of an obstacle.
+        """The packs nearest to the origin with no place within ``clearance`` of an obstacle; connected ones if any of them are.
+
+        Where obstacles leave no room for a pack, they are not minded.
 
         :param obstacles: ``(any, 2)`` [m]
         :param clearance: distance to keep from obstacles [m]
@@ -126,9 +128,12 @@ class Packs:
         away = np.linalg.norm(self.places[..., None, :] - obstacles, axis=-1).min(-1, initial=np.inf)
         # Only what an obstacle cuts into needs packs that lean away from it.
         orders = self._orders if away.min() < clearance else self._orders[:, :1]
-        orders = np.where((away >= clearance)[:, None], orders, np.inf)
-        chosen = np.argpartition(orders, n - 1, axis=-1)[..., :n].reshape(-1, n)
-        lattice = np.repeat(np.arange(len(self.places)), orders.shape[1])[:, None]
+        free = (away >= clearance)[:, None]
+        if (free.sum(-1) >= n).any():
+            orders = np.where(free, orders, np.inf)
+        chosen = np.argpartition(orders, n - 1, axis=-1)[..., :n]
+        is_free = np.isfinite(np.take_along_axis(orders, chosen, axis=-1)).all(-1)
+        chosen, lattice = chosen[is_free], np.nonzero(is_free)[0][:, None]
         packs, distances = self.places[lattice, chosen], self.distances[lattice, chosen].mean(1)
         nearest = np.argsort(distances, kind="stable")[: 3 * most]
         packs, distances = packs[nearest], distances[nearest]

@@ -11,6 +11,7 @@ from sb3_flock.settings import SettingsError
 from sb3_flock.sim import World, episode_rng, own_reward, reward_terms
 
 pytest.importorskip("pyrvo")
+pytest.importorskip("scipy")
 
 
 @pytest.mark.parametrize("n_vehicles", [1, 2, 5, 30])
@@ -29,6 +30,13 @@ def test_packs_are_connected_lattices_free_of_obstacles_the_nearest_first(n_vehi
         for _ in pack:
             reached |= {j for i in reached for j in np.flatnonzero(pack[i] < 0.1001).tolist()}
         assert reached == set(range(n_vehicles))
+
+
+def test_where_there_is_no_room_obstacles_are_not_minded():
+    everywhere = np.stack(np.meshgrid(*[np.linspace(-1, 1, 21)] * 2), axis=-1).reshape(-1, 2)
+    found, distances = Packs(5, 0.1).free(everywhere, 0.15)
+    assert found.shape == (20, 5, 2)
+    assert distances.min() < 0.085
 
 
 def test_packs_of_five_stand_as_near_as_geometry_allows():
