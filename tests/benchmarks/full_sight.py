@@ -20,7 +20,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
 from sb3_flock.envs.demonstrations import Teacher
 from sb3_flock.evaluation.controllers import TEACHERS, Orca
@@ -68,12 +67,7 @@ def places(weight: float, ahead: tuple[float, ...]) -> Goals:
         goals = np.empty_like(world.positions)
         for flock, vehicles in enumerate(world.positions - world.waypoints[:, None]):
             courses = np.concatenate([positions[flock] + velocities[flock] * time for time in ahead])
-            found, distances = packs.free(courses, 0.165, most=40)
-            ways = np.linalg.norm(vehicles[:, None] - found[:, None], axis=-1)
-            chosen = [linear_sum_assignment(way)[1] for way in ways]
-            sums = np.array([way[np.arange(5), places].mean() for way, places in zip(ways, chosen, strict=True)])
-            best = np.argmin(distances + weight * sums)
-            goals[flock] = found[best][chosen[best]]
+            goals[flock] = packs.given(vehicles, courses, 0.165, weight, most=40)
         return goals
 
     return plan

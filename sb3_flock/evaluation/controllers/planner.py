@@ -49,11 +49,6 @@ class Planner:
     def __init__(self, world: World, gains: PlannerGains | None = None) -> None:
         self.world, self.gains = world, gains or PlannerGains()
         self.orca = Orca(OrcaGains(margin=0.002))
-        try:
-            from scipy.optimize import linear_sum_assignment
-        except ImportError:
-            raise SettingsError("teacher = 'planner': needs scipy, pip install 'sb3_flock[orca]'") from None
-        self._assign = linear_sum_assignment
         self.packs = Packs(world.scenario.n_vehicles, self.gains.spacing * world.scenario.neighbor_separation)
 
     def reset(self, rngs: Sequence[Generator], scenario: Scenario) -> None:
@@ -84,13 +79,10 @@ class Planner:
     def _places(self, flock: int) -> Array:
         """A place for each vehicle ``(vehicles, 2)``, seen from the waypoint."""
         world, gains = self.world, self.gains
-        obstacles = world.obstacle_positions[flock] - world.waypoints[flock]
-        packs, costs = self.packs.free(obstacles, gains.clearance * world.scenario.obstacle_separation)
-        ways = np.linalg.norm((world.positions[flock] - world.waypoints[flock])[:, None] - packs[:, None], axis=-1)
-        chosen = [self._assign(way) for way in ways]
-        costs = costs + gains.way * np.array([way[pairs].mean() for way, pairs in zip(ways, chosen, strict=True)])
-        best = int(np.argmin(costs))
-        return packs[best][chosen[best][1]]
+        vehicles, obstacles = (
+            bodies[flock] - world.waypoints[flock] for bodies in (world.positions, world.obstacle_positions)
+        )
+        return self.packs.given(vehicles, obstacles, gains.clearance * world.scenario.obstacle_separation, gains.way)
 
 
 class Packs:
@@ -99,9 +91,15 @@ class Packs:
     :param n_vehicles: vehicles in a pack
     :param spacing: between neighbors of the lattice [m]
     :param lattices: number of lattices
+    :raises SettingsError: if ``scipy`` is not installed
     """
 
     def __init__(self, n_vehicles: int, spacing: float, lattices: int = 24) -> None:
+        try:
+            from scipy.optimize import linear_sum_assignment
+        except ImportError:
+            raise SettingsError("teacher = 'planner': needs scipy, pip install 'sb3_flock[orca]'") from None
+        self._assign = linear_sum_assignment
         rng = np.random.default_rng(0)
         reach = int(np.ceil(np.sqrt(n_vehicles))) + 3
         side = np.arange(-reach, reach + 1)
@@ -113,6 +111,21 @@ class Packs:
         self.distances = np.linalg.norm(self.places, axis=-1)
         leanings = [lean * np.array([np.cos(a), np.sin(a)]) for lean in (0.3, 0.8) for a in np.arange(8) * np.pi / 4]
         self._orders = np.stack([self.distances - self.places @ lean for lean in [np.zeros(2), *leanings]], axis=1)
+
+    def given(self, vehicles: Array, obstacles: Array, clearance: float, way: float, most: int = 20) -> Array:
+        """The places ``(vehicles, 2)`` [m] of the pack that is best for vehicles there, one for each.
+
+        :param vehicles: ``(vehicles, 2)`` [m]
+        :param way: weight of the vehicles' mean way to their places, beside the places' mean distance to the origin
+
+        The other parameters are those of :meth:`free`.
+        """
+        packs, costs = self.free(obstacles, clearance, most)
+        ways = np.linalg.norm(vehicles[:, None] - packs[:, None], axis=-1)
+        chosen = [self._assign(distances) for distances in ways]
+        costs = costs + way * np.array([distances[pairs].mean() for distances, pairs in zip(ways, chosen, strict=True)])
+        best = int(np.argmin(costs))
+        return packs[best][chosen[best][1]]
 
     def free(self, obstacles: Array, clearance: float, most: int = 20) -> tuple[Array, Array]:
         """The packs nearest to the origin with no place within ``clearance`` of an obstacle; connected ones if any of them are.
