@@ -53,7 +53,7 @@ class LearnerConfig(Settings):
     tau: float = Field(0.005, gt=0, le=1, description="update rate of the target networks (open)")
     guidance: NotNegative = Field(
         0.0,
-        description="weight of the mean squared difference to the teacher's actions in the actor's loss; ddpg alone (ours)",
+        description="weight of the mean absolute difference to the teacher's actions in the actor's loss; ddpg alone (ours)",
     )
     mirror: bool = Field(
         True,

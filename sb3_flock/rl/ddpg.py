@@ -20,7 +20,7 @@ class FlockDDPG(DDPG):
     The patches of a minibatch are gathered once for all networks that see it; the actor's step takes no gradient of the
     critic's weights, which nobody would use; the target networks follow in one operation; losses are read once a round.
 
-    :param guidance: weight of the mean squared difference to the advised actions, each from -1 to 1, in the actor's loss; if
+    :param guidance: weight of the mean absolute difference to the advised actions, each from -1 to 1, in the actor's loss; if
         it is not 0, the replay buffer must be a :class:`CompactReplayBuffer` with advice
 
     The other parameters are those of SB3's ``DDPG``. Every features extractor must be a :class:`FlockCNN`.
@@ -69,7 +69,7 @@ class FlockDDPG(DDPG):
             actions = self.actor(observations)
             actor_loss = -self.critic.q1_forward(observations, actions).mean()
             if self.guidance:
-                gap = F.mse_loss(actions, batch.advice)  # type: ignore[union-attr]
+                gap = F.l1_loss(actions, batch.advice)  # type: ignore[union-attr]
                 actor_loss = actor_loss + self.guidance * gap
                 gaps.append(gap.detach())
             _step(self.actor.optimizer, actor_loss, actor)

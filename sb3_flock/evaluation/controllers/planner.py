@@ -26,8 +26,10 @@ class PlannerGains:
     """Distance between neighboring places, relative to the minimum separation to neighbors."""
     clearance: float = 1.03
     """Distance of places from obstacles, relative to the minimum separation to them."""
-    way: float = 0.2
+    way: float = 0.5
     """Weight of the vehicles' mean way to their places, beside the places' mean distance to the waypoint."""
+    approach: float = 1.0
+    """Preferred velocity for each meter to the place [1/s]."""
     tolerance: float = 0.005
     """Distance that a vehicle keeps from its place, at rest and behind a moving one [m]."""
     calm: float = 0.015
@@ -48,7 +50,7 @@ class Planner:
 
     def __init__(self, world: World, gains: PlannerGains | None = None) -> None:
         self.world, self.gains = world, gains or PlannerGains()
-        self.orca = Orca(OrcaGains(margin=0.002))
+        self.orca = Orca(OrcaGains(margin=0.002, approach=self.gains.approach))
         self.packs = Packs(world.scenario.n_vehicles, self.gains.spacing * world.scenario.neighbor_separation)
 
     def reset(self, rngs: Sequence[Generator], scenario: Scenario) -> None:
@@ -59,7 +61,7 @@ class Planner:
         """The actions that fly ORCA's velocities towards the places, as fast as these move besides."""
         world, gains = self.world, self.gains
         places = world.waypoints[:, None] + np.stack([self._places(flock) for flock in range(world.n_flocks)])
-        offsets = places + world.waypoint_velocities[:, None] / self.orca.gains.approach - world.positions
+        offsets = places + world.waypoint_velocities[:, None] / gains.approach - world.positions
         distances = np.hypot(offsets[..., 0], offsets[..., 1])[..., None]
         offsets = offsets * np.maximum(0.0, 1.0 - gains.tolerance / np.maximum(distances, 1e-9))
         goals = rotate(offsets, -world.headings)
@@ -116,12 +118,13 @@ class Packs:
         """The places ``(vehicles, 2)`` [m] of the pack that is best for vehicles there, one for each.
 
         :param vehicles: ``(vehicles, 2)`` [m]
-        :param way: weight of the vehicles' mean way to their places, beside the places' mean distance to the origin
+        :param way: weight of the vehicles' mean way to their places, around obstacles, beside the places' mean distance to the
+            origin
 
         The other parameters are those of :meth:`free`.
         """
         packs, costs = self.free(obstacles, clearance, most)
-        ways = np.linalg.norm(vehicles[:, None] - packs[:, None], axis=-1)
+        ways = way_lengths(vehicles[:, None], packs[:, None], obstacles, clearance)
         chosen = [self._assign(distances) for distances in ways]
         costs = costs + way * np.array([distances[pairs].mean() for distances, pairs in zip(ways, chosen, strict=True)])
         best = int(np.argmin(costs))
@@ -160,3 +163,23 @@ class Packs:
         for _ in range(self.n_vehicles.bit_length()):
             reached = np.minimum(reached @ reached, 1.0)
         return reached.all(axis=(1, 2))
+
+
+def way_lengths(starts: Array, ends: Array, obstacles: Array, clearance: float) -> Array:
+    """The shortest ways ``(...)`` [m] around whichever obstacle makes them longest.
+
+    :param starts: ``(..., 2)`` [m], and so are ``ends``; both broadcast
+    :param obstacles: ``(any, 2)`` [m]
+    :param clearance: radius of the circles to go around; one that holds a start or an end shrinks to it [m]
+    """
+    lengths = np.linalg.norm(ends - starts, axis=-1)
+    straight = lengths
+    for obstacle in obstacles:
+        a, b = starts - obstacle, ends - obstacle
+        to_start, to_end = np.maximum(np.linalg.norm(a, axis=-1), 1e-9), np.maximum(np.linalg.norm(b, axis=-1), 1e-9)
+        radius = np.minimum(clearance, np.minimum(to_start, to_end))
+        between = np.arccos(np.clip((a * b).sum(-1) / (to_start * to_end), -1.0, 1.0))
+        arc = between - np.arccos(radius / to_start) - np.arccos(radius / to_end)  # what the two tangents leave
+        around = np.sqrt(to_start**2 - radius**2) + np.sqrt(to_end**2 - radius**2) + radius * arc
+        lengths = np.maximum(lengths, np.where(arc > 0, around, straight))
+    return lengths

@@ -5,7 +5,7 @@ import pytest
 
 from sb3_flock import Scenario
 from sb3_flock.evaluation.controllers import CONTROLLERS, Orca, Planner
-from sb3_flock.evaluation.controllers.planner import Packs
+from sb3_flock.evaluation.controllers.planner import Packs, way_lengths
 from sb3_flock.evaluation.metrics import EpisodeMetrics
 from sb3_flock.settings import SettingsError
 from sb3_flock.sim import World, episode_rng, own_reward, reward_terms
@@ -42,6 +42,24 @@ def test_where_there_is_no_room_obstacles_are_not_minded():
 def test_packs_of_five_stand_as_near_as_geometry_allows():
     _, distances = Packs(5, 0.1, lattices=200).free(np.empty((0, 2)), 0.15)
     assert distances.min() == pytest.approx(0.0780, abs=0.0015)
+
+
+def test_ways_go_around_obstacles():
+    left, right, above = np.array([-1.0, 0.0]), np.array([1.0, 0.0]), np.array([0.0, 1.0])
+    middle = np.zeros((1, 2))
+    tangents_and_arc = 2 * np.sqrt(0.75) + 0.5 * (np.pi - 2 * np.arccos(0.5))
+    assert way_lengths(left, right, middle, 0.5) == pytest.approx(tangents_and_arc)
+    assert way_lengths(left, above, middle, 0.5) == pytest.approx(np.sqrt(2))  # it passes at 0.7
+    assert way_lengths(left, right, np.empty((0, 2)), 0.5) == pytest.approx(2)
+    assert way_lengths(left, right, np.array([[0.0, 3.0], [0.0, 0.0], [0.0, 0.45]]), 0.5) == pytest.approx(tangents_and_arc)
+    assert way_lengths(0.4 * left, right, middle, 0.5) == pytest.approx(np.sqrt(0.84) + 0.4 * (np.pi - np.arccos(0.4)))
+    assert way_lengths(middle, right, middle, 0.5) == pytest.approx(1)
+
+
+def test_places_across_an_obstacle_are_far():
+    ring = 0.16 * np.array([[np.cos(angle), np.sin(angle)] for angle in np.deg2rad([0, 40, 80, 120, 160])])
+    places = Packs(5, 0.104).given(ring, np.array([[0.0, -0.01]]), 0.155, way=1.0)
+    assert np.linalg.norm(places - ring, axis=-1).max() < 0.12
 
 
 def flown(pilot, scenario, episodes):
