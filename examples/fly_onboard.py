@@ -33,7 +33,7 @@ def measured(points):
 looks = []  # what was measured, where and facing where: only the policies with a second look need it
 steps_back = round(task["look_back"] / task["time_step"])
 
-for step in range(150):
+for step in range(100):
     now = {"neighbors": measured(neighbors), "obstacles": measured(obstacles), "waypoint": measured(waypoint)[0]}
     looks = [*looks, (now, position, heading)][-1 - steps_back :]
     inputs = now

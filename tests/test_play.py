@@ -119,9 +119,9 @@ def test_a_flight_has_no_end(game):
 def test_policies_and_laws_that_remember_fly_while_the_flock_changes():
     late = SensorErrors(position_noise=0.01, delay=0.2)
     for flyer, changes in (
-        (load_policy("general"), {}),
-        (load_policy("general"), {"sensors": late}),
-        (load_policy("second-look-5v2o"), {"look_back": 0.2}),
+        (load_policy("paper-5v2o"), {}),
+        (load_policy("paper-5v2o"), {"sensors": late}),
+        (load_policy("general"), {"look_back": 0.2}),
         (make_controller("orca"), {}),
     ):
         game = Game(flyer, Scenario(n_vehicles=2, n_obstacles=1, **changes))

@@ -189,7 +189,7 @@ def test_a_policy_flies_over_a_grid_as_it_does_in_evaluate(tmp_path):
         (["--evaluate", "nobody"], "nobody: no such file or run folder"),
         (
             ["--evaluate", "general", "--set", "n_anchors=7"],
-            "general.zip: it sees tensors of (3, 11, 11), but the scenario's (n_anchors = 7, look_back = 0.0) are of (3, 7, 7)",
+            "general.zip: it sees tensors of (6, 11, 11), but the scenario's (n_anchors = 7, look_back = 0.2) are of (6, 7, 7)",
         ),
         (["--evaluate", "general", "--set", "gamma=0.5"], "learner.gamma does not tell on a flight"),
         (["--episodes", "3"], "--episodes 3: only with --evaluate"),
