@@ -173,7 +173,6 @@ def way_lengths(starts: Array, ends: Array, obstacles: Array, clearance: float) 
     :param clearance: radius of the circles to go around; one that holds a start or an end shrinks to it [m]
     """
     lengths = np.linalg.norm(ends - starts, axis=-1)
-    straight = lengths
     for obstacle in obstacles:
         a, b = starts - obstacle, ends - obstacle
         to_start, to_end = np.maximum(np.linalg.norm(a, axis=-1), 1e-9), np.maximum(np.linalg.norm(b, axis=-1), 1e-9)
@@ -181,5 +180,5 @@ def way_lengths(starts: Array, ends: Array, obstacles: Array, clearance: float) 
         between = np.arccos(np.clip((a * b).sum(-1) / (to_start * to_end), -1.0, 1.0))
         arc = between - np.arccos(radius / to_start) - np.arccos(radius / to_end)  # what the two tangents leave
         around = np.sqrt(to_start**2 - radius**2) + np.sqrt(to_end**2 - radius**2) + radius * arc
-        lengths = np.maximum(lengths, np.where(arc > 0, around, straight))
+        lengths = np.maximum(lengths, np.where(arc > 0, around, 0.0))
     return lengths
