@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -66,14 +66,26 @@ def fly(
         check_integer(name, value, least)
     results = []
     for start in range(0, episodes, batch):
-        numbers = range(start, min(start + batch, episodes))
-        metrics = EpisodeMetrics(scenario, len(numbers))
-        world, sensing = _begin(controller, scenario, [episode_rng(seed, episode) for episode in numbers])
-        for _ in range(scenario.max_cycles):
-            sensing, clipped = world.step(controller.act(world.sensors.measure(sensing), scenario))
-            metrics.update(world, sensing, own_reward(reward_terms(sensing, clipped, scenario)))
-        results.append(metrics.result())
+        rngs = [episode_rng(seed, episode) for episode in range(start, min(start + batch, episodes))]
+        results.append(fly_together(lambda world: controller, scenario, rngs))
     return {name: np.concatenate([result[name] for result in results]) for name in results[0]}
+
+
+def fly_together(
+    pilot: Callable[[World], Controller], scenario: Scenario, rngs: Sequence[np.random.Generator]
+) -> dict[str, NDArray[np.float64]]:
+    """Fly episodes in lockstep.
+
+    :param pilot: who flies a world; it may be one who sees all of it
+    :param rngs: one generator an episode
+    :return: each metric's value for each episode, ``(episodes,)``
+    """
+    metrics = EpisodeMetrics(scenario, len(rngs))
+    world, sensing, controller = _begin(pilot, scenario, rngs)
+    for _ in range(scenario.max_cycles):
+        sensing, clipped = world.step(controller.act(world.sensors.measure(sensing), scenario))
+        metrics.update(world, sensing, own_reward(reward_terms(sensing, clipped, scenario)))
+    return metrics.result()
 
 
 def fly_one(policy: Any, scenario: Scenario, seed: int = 0, episode: int = 0) -> Iterator[World]:
@@ -84,21 +96,23 @@ def fly_one(policy: Any, scenario: Scenario, seed: int = 0, episode: int = 0) ->
     """
     check_integer("seed", seed, 0)
     check_integer("episode", episode, 0)
-    controller = as_controller(policy, scenario)
-    world, sensing = _begin(controller, scenario, [episode_rng(seed, episode)])
+    flies = as_controller(policy, scenario)
+    world, sensing, controller = _begin(lambda world: flies, scenario, [episode_rng(seed, episode)])
     yield world
     for _ in range(scenario.max_cycles):
         sensing, _ = world.step(controller.act(world.sensors.measure(sensing), scenario))
         yield world
 
 
-def _begin(controller: Controller, scenario: Scenario, rngs: list[np.random.Generator]) -> tuple[World, Sensing]:
-    """A world at the start of its episodes, one a generator, and what is sensed there; the controller is told."""
+def _begin(
+    pilot: Callable[[World], Controller], scenario: Scenario, rngs: Sequence[np.random.Generator]
+) -> tuple[World, Sensing, Controller]:
+    """A world at the start of its episodes, one a generator, what is sensed there, and who flies, who is told."""
     world = World(scenario, len(rngs))
-    sensing = world.reset(rngs)
+    sensing, controller = world.reset(rngs), pilot(world)
     if hasattr(controller, "reset"):
         controller.reset(rngs, scenario)
-    return world, sensing
+    return world, sensing, controller
 
 
 def as_controller(policy: Any, scenario: Scenario) -> Controller:

@@ -100,10 +100,17 @@ class World:
             self._frames = _directions(self._headings)
         return self._frames
 
-    @property
-    def waypoint_velocities(self) -> NDArray[np.float64]:
-        """``(flocks, 2)`` [m/s], over the next step."""
-        return (self._next_waypoints() - self.waypoints) / self.scenario.time_step
+    def waypoints_after(self, steps: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Where the waypoint will be: straight towards the origin (section V), or along the route.
+
+        :param steps: from now on, any number for each flock, ``(flocks, any)``
+        :return: ``(flocks, any, 2)`` [m]
+        """
+        route, stride = self.scenario.waypoint_route, self.scenario.waypoint_speed * self.scenario.time_step
+        if route is not None:
+            return along(np.array(route), stride * (self.steps + steps))
+        distances = np.sqrt(np.square(self.waypoints).sum(-1, keepdims=True))
+        return self.waypoints[:, None] * (1.0 - np.minimum(stride * steps / np.maximum(distances, 1e-12), 1.0))[..., None]
 
     def reset(self, rngs: Sequence[Generator]) -> Sensing:
         """Start an episode in every flock (section V).
@@ -145,7 +152,7 @@ class World:
         self.positions = _moved(self.positions, self.frames, clipped[..., 0], dt)
         self.headings = wrap_angle(self.headings + clipped[..., 1] * dt)
         self._move_obstacles(dt)
-        self.waypoints = self._next_waypoints()
+        self.waypoints = self.waypoints_after(np.ones((self.n_flocks, 1)))[:, 0]
         self.steps += 1
         return sense(self, clipped * dt), clipped
 
@@ -179,14 +186,6 @@ class World:
             setattr(self, name, np.array(state[name], dtype=np.float64))
         self.steps = int(state["steps"])
         self.sensors.load_state_dict(state["sensors"])
-
-    def _next_waypoints(self) -> NDArray[np.float64]:
-        """Straight towards the origin (section V), or along the route."""
-        route, stride = self.scenario.waypoint_route, self.scenario.waypoint_speed * self.scenario.time_step
-        if route is not None:
-            return np.broadcast_to(along(np.array(route), stride * (self.steps + 1)), self.waypoints.shape).copy()
-        distance = np.sqrt(np.square(self.waypoints).sum(-1, keepdims=True))
-        return self.waypoints * (1.0 - np.minimum(stride / np.maximum(distance, stride or 1.0), 1.0))
 
     def _move_obstacles(self, dt: float) -> None:
         """Unicycles with drawn speeds and turn rates, turned back at the edge of their square."""
@@ -262,10 +261,10 @@ def _directions(headings: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack((np.cos(headings), np.sin(headings)), axis=-1)
 
 
-def along(route: NDArray[np.float64], distance: float) -> NDArray[np.float64]:
-    """The point so far along a route ``(points, 2)`` [m], ``(2,)``; at its end beyond."""
+def along(route: NDArray[np.float64], distances: NDArray[np.floating]) -> NDArray[np.float64]:
+    """The points so far ``(...)`` along a route ``(points, 2)`` [m], ``(..., 2)``; at its end beyond."""
     lengths = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(route, axis=0).T))))
-    return np.array([np.interp(distance, lengths, coordinate) for coordinate in route.T])
+    return np.stack([np.interp(distances, lengths, coordinate) for coordinate in route.T], axis=-1)
 
 
 def wrap_angle(angles: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -34,14 +34,18 @@ def test_the_waypoint_heads_for_the_origin_and_stays_there(scenario, place):
 
 
 @pytest.mark.parametrize("route", [None, [(0.0, 0.0), (0.25, 0.0), (0.25, 1.0)]])
-def test_the_waypoints_velocity_is_that_of_its_next_step(scenario, route):
+def test_where_the_waypoint_will_be_is_where_it_goes(scenario, route):
     world = World(scenario.replace(waypoint_route=route), 3)
     world.reset([np.random.default_rng(seed) for seed in range(3)])
+    world.step(np.zeros((3, scenario.n_vehicles, 2)))
+    steps = np.array([[0, 5, 30, 40], [0, 5, 30, 40], [40, 0, 5, 30]])
+    told = world.waypoints_after(steps)
+    seen = [world.waypoints]
     for _ in range(40):
-        before, velocities = world.waypoints, world.waypoint_velocities
         world.step(np.zeros((3, scenario.n_vehicles, 2)))
-        np.testing.assert_allclose(world.waypoints - before, velocities * scenario.time_step, atol=1e-12)
-    assert np.hypot(*velocities.T).max() == pytest.approx(scenario.waypoint_speed)
+        seen.append(world.waypoints)
+    np.testing.assert_allclose(told, np.stack(seen, axis=1)[np.arange(3)[:, None], steps], atol=1e-12)
+    assert np.ptp(told, axis=1).max() > 10 * scenario.waypoint_speed * scenario.time_step
 
 
 def test_a_waypoint_on_the_origin_or_without_speed_stays(scenario, place):

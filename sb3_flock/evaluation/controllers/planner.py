@@ -26,8 +26,12 @@ class PlannerGains:
     """Distance between neighboring places, relative to the minimum separation to neighbors."""
     clearance: float = 1.03
     """Distance of places from obstacles, relative to the minimum separation to them."""
-    way: float = 0.5
+    way: float = 0.8
     """Weight of the vehicles' mean way to their places, beside the places' mean distance to the waypoint."""
+    apart: float = 0.3
+    """Weight of the share of looks ahead in which the flock has come apart on its way, beside the same [m]."""
+    hold: float = 0.9
+    """Distance at which vehicles hold together on their way, relative to the link range."""
     approach: float = 1.0
     """Preferred velocity for each meter to the place [1/s]."""
     tolerance: float = 0.005
@@ -40,7 +44,8 @@ class Planner:
     """Gives each vehicle a place of its own around the waypoint, and lets :class:`Orca` fly them there.
 
     The places are a connected part of a hexagonal lattice, free of obstacles: of many lattices, turned and shifted, the one
-    where the vehicles stand nearest to the waypoint and have the shortest ways. Places are given by where everything is, so it
+    where the vehicles stand nearest to the waypoint, have the shortest ways and hold together on them. Vehicles fly to where the
+    waypoint will be when they meet it. Places are given by where everything is, so it
     is no peer of a policy that flies by what one vehicle senses; on its way a vehicle minds what it senses itself.
 
     :param world: the world that it sees, whatever is sensed in it
@@ -60,8 +65,8 @@ class Planner:
     def act(self, sensing: Sensing, scenario: Scenario) -> Array:
         """The actions that fly ORCA's velocities towards the places, as fast as these move besides."""
         world, gains = self.world, self.gains
-        places = world.waypoints[:, None] + np.stack([self._places(flock) for flock in range(world.n_flocks)])
-        offsets = places + world.waypoint_velocities[:, None] / gains.approach - world.positions
+        places = np.stack([self._places(flock) for flock in range(world.n_flocks)])
+        offsets = places + self._meetings(places) - world.positions
         distances = np.hypot(offsets[..., 0], offsets[..., 1])[..., None]
         offsets = offsets * np.maximum(0.0, 1.0 - gains.tolerance / np.maximum(distances, 1e-9))
         goals = rotate(offsets, -world.headings)
@@ -80,11 +85,35 @@ class Planner:
 
     def _places(self, flock: int) -> Array:
         """A place for each vehicle ``(vehicles, 2)``, seen from the waypoint."""
-        world, gains = self.world, self.gains
+        world, scenario, gains = self.world, self.world.scenario, self.gains
         vehicles, obstacles = (
             bodies[flock] - world.waypoints[flock] for bodies in (world.positions, world.obstacle_positions)
         )
-        return self.packs.given(vehicles, obstacles, gains.clearance * world.scenario.obstacle_separation, gains.way)
+        clearance = gains.clearance * scenario.obstacle_separation
+        packs, distances = self.packs.free(obstacles, clearance)
+        places, ways = self.packs.given(packs, vehicles, obstacles, clearance)
+        offsets = places - vehicles
+        flown = scenario.max_speed * _LOOKS[:, None, None, None]
+        shares = np.minimum(1.0, flown / np.maximum(np.linalg.norm(offsets, axis=-1, keepdims=True), 1e-9))
+        apart = 1.0 - _connected(vehicles + shares * offsets, gains.hold * scenario.link_range).mean(0)
+        return places[np.argmin(distances + gains.way * ways + gains.apart * apart)]
+
+    def _meetings(self, places: Array) -> Array:
+        """Where the waypoint ``(flocks, vehicles, 2)`` will be when a vehicle can be at its place beside it.
+
+        It is never nearer than the time that a vehicle takes to slow down at its place.
+        """
+        world, scenario = self.world, self.world.scenario
+        times = np.zeros(places.shape[:2])
+        for _ in range(10):
+            times = np.maximum(times, 1.0 / self.gains.approach)
+            waypoints = world.waypoints_after(times / scenario.time_step)
+            times = np.linalg.norm(waypoints + places - world.positions, axis=-1) / scenario.max_speed
+        return waypoints
+
+
+_LOOKS = np.array([0.25, 0.5, 0.75, 1.0])
+"""Times ahead at which a flock on its way should be in one piece [s]."""
 
 
 class Packs:
@@ -114,22 +143,6 @@ class Packs:
         leanings = [lean * np.array([np.cos(a), np.sin(a)]) for lean in (0.3, 0.8) for a in np.arange(8) * np.pi / 4]
         self._orders = np.stack([self.distances - self.places @ lean for lean in [np.zeros(2), *leanings]], axis=1)
 
-    def given(self, vehicles: Array, obstacles: Array, clearance: float, way: float, most: int = 20) -> Array:
-        """The places ``(vehicles, 2)`` [m] of the pack that is best for vehicles there, one for each.
-
-        :param vehicles: ``(vehicles, 2)`` [m]
-        :param way: weight of the vehicles' mean way to their places, around obstacles, beside the places' mean distance to the
-            origin
-
-        The other parameters are those of :meth:`free`.
-        """
-        packs, costs = self.free(obstacles, clearance, most)
-        ways = way_lengths(vehicles[:, None], packs[:, None], obstacles, clearance)
-        chosen = [self._assign(distances) for distances in ways]
-        costs = costs + way * np.array([distances[pairs].mean() for distances, pairs in zip(ways, chosen, strict=True)])
-        best = int(np.argmin(costs))
-        return packs[best][chosen[best][1]]
-
     def free(self, obstacles: Array, clearance: float, most: int = 20) -> tuple[Array, Array]:
         """The packs nearest to the origin with no place within ``clearance`` of an obstacle; connected ones if any of them are.
 
@@ -153,16 +166,32 @@ class Packs:
         packs, distances = self.places[lattice, chosen], self.distances[lattice, chosen].mean(1)
         nearest = np.argsort(distances, kind="stable")[: 3 * most]
         packs, distances = packs[nearest], distances[nearest]
-        whole = self._connected(packs)
+        whole = _connected(packs, 1.01 * self.spacing)
         if whole.any():
             packs, distances = packs[whole], distances[whole]
         return packs[:most], distances[:most]
 
-    def _connected(self, packs: Array) -> NDArray[np.bool_]:
-        reached = (np.linalg.norm(packs[:, :, None] - packs[:, None], axis=-1) < 1.01 * self.spacing).astype(np.float32)
-        for _ in range(self.n_vehicles.bit_length()):
-            reached = np.minimum(reached @ reached, 1.0)
-        return reached.all(axis=(1, 2))
+    def given(self, packs: Array, vehicles: Array, obstacles: Array, clearance: float) -> tuple[Array, Array]:
+        """The packs with the place of each vehicle, and the vehicles' mean ways there, the shortest, around obstacles.
+
+        :param packs: ``(packs, vehicles, 2)`` [m], in any order
+        :param vehicles: where they are, ``(vehicles, 2)`` [m]
+
+        The other parameters are those of :meth:`free`.
+
+        :return: the packs in the vehicles' order ``(packs, vehicles, 2)`` and the mean ways ``(packs,)``, both in meters
+        """
+        ways = way_lengths(vehicles[:, None], packs[:, None], obstacles, clearance)
+        chosen = np.array([self._assign(lengths)[1] for lengths in ways])[..., None]
+        return np.take_along_axis(packs, chosen, axis=1), np.take_along_axis(ways, chosen, axis=2).mean((1, 2))
+
+
+def _connected(positions: Array, reach: float) -> NDArray[np.bool_]:
+    """Whether all vehicles ``(..., vehicles, 2)`` hold together over distances below ``reach`` [m], ``(...)``."""
+    reached = (np.linalg.norm(positions[..., :, None, :] - positions[..., None, :, :], axis=-1) < reach).astype(np.float32)
+    for _ in range(positions.shape[-2].bit_length()):
+        reached = np.minimum(reached @ reached, 1.0)
+    return reached.all(axis=(-2, -1))
 
 
 def way_lengths(starts: Array, ends: Array, obstacles: Array, clearance: float) -> Array:

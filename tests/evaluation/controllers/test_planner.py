@@ -5,10 +5,10 @@ import pytest
 
 from sb3_flock import Scenario
 from sb3_flock.evaluation.controllers import CONTROLLERS, Orca, Planner
-from sb3_flock.evaluation.controllers.planner import Packs, way_lengths
-from sb3_flock.evaluation.metrics import EpisodeMetrics
+from sb3_flock.evaluation.controllers.planner import Packs, PlannerGains, _connected, way_lengths
+from sb3_flock.evaluation.episodes import fly_together
 from sb3_flock.settings import SettingsError
-from sb3_flock.sim import World, episode_rng, own_reward, reward_terms
+from sb3_flock.sim import World, episode_rng
 
 pytest.importorskip("pyrvo")
 pytest.importorskip("scipy")
@@ -58,21 +58,71 @@ def test_ways_go_around_obstacles():
 
 def test_places_across_an_obstacle_are_far():
     ring = 0.16 * np.array([[np.cos(angle), np.sin(angle)] for angle in np.deg2rad([0, 40, 80, 120, 160])])
-    places = Packs(5, 0.104).given(ring, np.array([[0.0, -0.01]]), 0.155, way=1.0)
-    assert np.linalg.norm(places - ring, axis=-1).max() < 0.12
+    obstacle, packs = np.array([[0.0, -0.01]]), Packs(5, 0.104)
+    places, ways = packs.given(packs.free(obstacle, 0.155)[0], ring, obstacle, 0.155)
+    assert (ways >= np.linalg.norm(places - ring, axis=-1).mean(1)).all()
+    assert np.linalg.norm(places[np.argmin(ways)] - ring, axis=-1).max() < 0.12
+
+
+def test_each_vehicle_gets_a_place_of_its_own_and_the_ways_are_short():
+    packs = Packs(5, 0.104)
+    found, _ = packs.free(np.empty((0, 2)), 0.15)
+    places, ways = packs.given(found, found[0][::-1], np.empty((0, 2)), 0.15)
+    np.testing.assert_array_equal(places[0], found[0][::-1])
+    assert ways[0] == 0
+    np.testing.assert_allclose(np.sort(places, axis=1), np.sort(found, axis=1))
+    assert (ways <= np.linalg.norm(found - found[0][::-1], axis=-1).mean(1) + 1e-12).all()
+
+
+def test_vehicles_head_for_where_they_meet_the_waypoint():
+    """A waypoint passing by is met ahead, on a straight way, and not followed from behind."""
+    task = Scenario(n_vehicles=1, n_obstacles=0, waypoint_route=[(0.0, 0.0), (3.0, 0.0)])
+    world, rngs = World(task), [episode_rng(0, 0)]
+    planner = Planner(world)
+    sensing = world.reset(rngs)
+    planner.reset(rngs, task)
+    world.positions, world.headings = np.array([[[0.0, -0.6]]]), np.array([[0.0]])
+    meets_after = 0.6 / np.sqrt(task.max_speed**2 - task.waypoint_speed**2)
+    for step in range(task.max_cycles):
+        sensing, _ = world.step(planner.act(sensing, task))
+        if step == 20:
+            assert world.headings.item() == pytest.approx(np.arccos(task.waypoint_speed / task.max_speed), abs=0.05)
+        if np.linalg.norm(world.positions[0, 0] - world.waypoints[0]) < 0.05:
+            break
+    assert step * task.time_step < meets_after + 0.8  # following it takes 7.2 s
+
+
+def test_a_flock_holds_together_on_its_way_where_it_can():
+    task = Scenario(n_vehicles=5, n_obstacles=2)
+    world = World(task)
+    world.reset([episode_rng(0, 0)])
+    world.waypoints = np.zeros((1, 2))
+    careless, careful = (Planner(world, PlannerGains(apart=apart)) for apart in (0.0, 100.0))
+    rng, gained = np.random.default_rng(0), []
+    for _ in range(60):
+        vehicles = np.cumsum(rng.uniform(-0.14, 0.14, (5, 2)), axis=0)
+        world.positions, world.obstacle_positions = vehicles[None], rng.uniform(-0.2, 0.2, (1, 2, 2))
+        whole = []
+        for planner in (careless, careful):
+            offsets = planner._places(0) - vehicles
+            lengths = np.linalg.norm(offsets, axis=-1, keepdims=True)
+            later = [vehicles + offsets * np.minimum(1.0, way / lengths) for way in (0.0375, 0.075, 0.1125, 0.15)]
+            whole.append(sum(bool(_connected(looked, 0.9 * task.link_range)) for looked in later))
+        gained.append(whole[1] - whole[0])
+    assert min(gained) == 0
+    assert max(gained) > 0
+
+
+def test_vehicles_hold_together_over_others():
+    chain = np.stack((0.1 * np.arange(6), np.zeros(6)), axis=-1)
+    gap = chain + np.where(np.arange(6) > 2, 0.05, 0.0)[:, None]
+    np.testing.assert_array_equal(_connected(np.stack((chain, gap)), 0.11), [True, False])
+    assert _connected(chain[:1], 0.1)
 
 
 def flown(pilot, scenario, episodes):
-    world = World(scenario, episodes)
-    pilot = pilot(world)
-    rngs = [episode_rng(5, episode) for episode in range(episodes)]
-    sensing = world.reset(rngs)
-    pilot.reset(rngs, scenario)
-    metrics = EpisodeMetrics(scenario, episodes)
-    for _ in range(scenario.max_cycles):
-        sensing, clipped = world.step(pilot.act(sensing, scenario))
-        metrics.update(world, sensing, own_reward(reward_terms(sensing, clipped, scenario)))
-    return {name: np.nanmean(values) for name, values in metrics.result().items()}
+    results = fly_together(pilot, scenario, [episode_rng(5, episode) for episode in range(episodes)])
+    return {name: np.nanmean(values) for name, values in results.items()}
 
 
 def test_its_flocks_stand_nearer_and_hold_together_better_than_those_without_full_sight():
