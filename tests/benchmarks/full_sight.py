@@ -34,7 +34,7 @@ COLUMNS = ("tracking_error", "neighbor_violation_rate", "obstacle_violation_rate
 
 Array = NDArray[np.float64]
 
-LOOKS, ROUNDS, PACE = 20, 20, 0.03
+LOOKS, ROUNDS, PACE = 20, 100, 0.03
 """Steps planned ahead, rounds of descent in each step, and how far a control moves in a round at most [its bound]."""
 SEPARATION, CLEARANCE, REACH = 1.03, 1.033, 0.93
 """Distances that plans keep, relative to the minimum separations to neighbors and obstacles and to the link range."""
