@@ -27,6 +27,7 @@ from sb3_flock.evaluation.controllers import Orca, Planner
 from sb3_flock.evaluation.controllers.planner import Packs
 from sb3_flock.evaluation.episodes import Controller, fly_together
 from sb3_flock.sim import Scenario, Sensing, World, episode_rng
+from sb3_flock.sim.sensing import nearest
 
 CROSSING = Scenario(n_vehicles=5, n_obstacles=2, obstacle_motion="crossing")
 SEED = 1
@@ -60,7 +61,7 @@ class Foresight:
         headings = np.stack((np.cos(world.obstacle_headings), np.sin(world.obstacle_headings)), axis=-1)
         strides = world.obstacle_speeds.mean(0)[..., None] * headings * scenario.time_step
         obstacles = world.obstacle_positions[:, None] + strides[:, None] * steps[:, None, None]
-        gaps = np.linalg.norm(world.positions[:, :, None] - world.obstacle_positions[:, None], axis=-1).min(1)
+        gaps = nearest(world.obstacle_positions, world.positions)
         bounds = np.array([scenario.max_speed, scenario.max_turn_rate])
         ranges = (
             SEPARATION * scenario.neighbor_separation,

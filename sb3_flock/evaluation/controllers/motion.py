@@ -29,11 +29,9 @@ def steer(velocities: NDArray[np.float64], scenario: Scenario) -> NDArray[np.flo
     )
 
 
-def limit(velocities: NDArray[np.float64], speed: float) -> NDArray[np.float64]:
-    """The velocities ``(..., 2)``, shortened to a speed where they exceed it."""
-    return (
-        velocities * np.minimum(1.0, speed / np.maximum(np.hypot(velocities[..., 0], velocities[..., 1]), 1e-12))[..., None]
-    )
+def limit(vectors: NDArray[np.float64], length: float | NDArray[np.float64]) -> NDArray[np.float64]:
+    """The vectors ``(..., 2)``, shortened to a length where they exceed it; one for all, or any that broadcast to ``(...)``."""
+    return vectors * np.minimum(1.0, length / np.maximum(np.hypot(vectors[..., 0], vectors[..., 1]), 1e-12))[..., None]
 
 
 def rotate(vectors: NDArray[np.float64], angles: NDArray[np.float64]) -> NDArray[np.float64]:

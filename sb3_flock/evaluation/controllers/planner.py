@@ -10,7 +10,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from sb3_flock.evaluation.controllers.motion import rotate, steer
+from sb3_flock.evaluation.controllers.motion import limit, rotate, steer
 from sb3_flock.evaluation.controllers.orca import Orca, OrcaGains
 from sb3_flock.settings import SettingsError
 from sb3_flock.sim import Scenario, Sensing, World
@@ -45,8 +45,8 @@ class Planner:
 
     The places are a connected part of a hexagonal lattice, free of obstacles: of many lattices, turned and shifted, the one
     where the vehicles stand nearest to the waypoint, have the shortest ways and hold together on them. Vehicles fly to where the
-    waypoint will be when they meet it. Places are given by where everything is, so it
-    is no peer of a policy that flies by what one vehicle senses; on its way a vehicle minds what it senses itself.
+    waypoint will be when they meet it. Places are given by where everything is, so it is no peer of a policy that flies by what
+    one vehicle senses; on its way a vehicle minds what it senses itself.
 
     :param world: the world that it sees, whatever is sensed in it
     :param gains: found by a few trials
@@ -92,10 +92,8 @@ class Planner:
         clearance = gains.clearance * scenario.obstacle_separation
         packs, distances = self.packs.free(obstacles, clearance)
         places, ways = self.packs.given(packs, vehicles, obstacles, clearance)
-        offsets = places - vehicles
-        flown = scenario.max_speed * _LOOKS[:, None, None, None]
-        shares = np.minimum(1.0, flown / np.maximum(np.linalg.norm(offsets, axis=-1, keepdims=True), 1e-9))
-        apart = 1.0 - _connected(vehicles + shares * offsets, gains.hold * scenario.link_range).mean(0)
+        flown = limit(places - vehicles, scenario.max_speed * _LOOKS[:, None, None])
+        apart = 1.0 - _connected(vehicles + flown, gains.hold * scenario.link_range).mean(0)
         return places[np.argmin(distances + gains.way * ways + gains.apart * apart)]
 
     def _meetings(self, places: Array) -> Array:
