@@ -102,8 +102,9 @@ class PracticeConfig(Settings):
     obstacle_separation_ratio: float | None = Field(
         None, ge=1, le=1e6, description="the same for obstacles; null: separation_ratio (ours; paper: 1)"
     )
-    teacher: Literal["orca", "olfati-saber", "planner"] | None = Field(
-        None, description="who flies some of the episodes for the policy to learn from; planner: sees all; null: none (ours)"
+    teacher: Literal["orca", "olfati-saber", "planner", "foresight"] | None = Field(
+        None,
+        description="who flies some episodes for the policy to learn from; planner, foresight: see all; null: none (ours)",
     )
     teacher_share: float = Field(0.25, ge=0, le=1, description="share of the episodes that the teacher flies (ours)")
     teacher_noise: NotNegative = Field(
@@ -163,9 +164,13 @@ class TrainingConfig(Settings):
 
     @model_validator(mode="after")
     def _guided_by_someone(self) -> TrainingConfig:
-        advises = self.practice.teacher in ("orca", "planner")  # Olfati-Saber's law knows its velocity only where it flies
+        advises = self.practice.teacher in (
+            "orca",
+            "planner",
+            "foresight",
+        )  # Olfati-Saber's law knows its velocity only where it flies
         if self.learner.guidance and not (advises and self.algo == "ddpg" and self.learner.n_steps == 1):
-            needed = "practice.teacher orca or planner, algo ddpg and n_steps 1"
+            needed = "practice.teacher orca, planner or foresight, algo ddpg and n_steps 1"
             raise ValueError(f"guidance = {self.learner.guidance}: input should be 0 without {needed}")
         return self
 

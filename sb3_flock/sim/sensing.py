@@ -219,8 +219,10 @@ def distance_blocks(
 
 def nearest(positions: NDArray[np.float64], bodies: NDArray[np.float64], others: bool = False) -> NDArray[np.float64]:
     """Each vehicle's distance to the nearest body, in range or not: ``(flocks, vehicles)`` [m], inf where there is none."""
-    blocks = [distances.min(-1, initial=np.inf) for _, distances in distance_blocks(positions, bodies, others)]
-    return np.concatenate(blocks, axis=1)
+    found = np.empty(positions.shape[:2])
+    for rows, distances in distance_blocks(positions, bodies, others):
+        found[:, rows] = distances.min(-1, initial=np.inf)
+    return found
 
 
 def is_connected(neighbors: Contacts) -> NDArray[np.bool_]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from sb3_flock.envs.demonstrations import Teacher
+from sb3_flock.evaluation.controllers.foresight import Foresight
 from sb3_flock.evaluation.controllers.olfati_saber import OlfatiSaber
 from sb3_flock.evaluation.controllers.orca import Orca
 from sb3_flock.evaluation.controllers.planner import Planner
@@ -25,12 +26,14 @@ TEACHERS: dict[str, Callable[[World], Teacher]] = {
     "olfati-saber": lambda world: OlfatiSaber(),
     "orca": lambda world: Orca(),
     "planner": Planner,
+    "foresight": Foresight,
 }
 """Who can fly and advise for a policy to learn from, by name. A teacher may see the whole world, a controller may not."""
 
 __all__ = [
     "CONTROLLERS",
     "TEACHERS",
+    "Foresight",
     "GoToWaypoint",
     "OlfatiSaber",
     "Orca",

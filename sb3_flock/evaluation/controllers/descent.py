@@ -1,0 +1,136 @@
+"""The descent of :mod:`~sb3_flock.evaluation.controllers.foresight`, compiled by numba."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+class Wants(NamedTuple):
+    """What plans should keep, and what it weighs [1/m] beside a mean meter to the goals."""
+
+    separation: float
+    """Distance between vehicles [m]."""
+    clearance: float
+    """Distance to obstacles [m]."""
+    reach: float
+    """Length of the links that join the flock [m]."""
+    separation_weight: float = 500.0
+    clearance_weight: float = 1000.0
+    reach_weight: float = 60.0
+
+
+@njit(error_model="numpy", cache=True)
+def descend(
+    plan: Array,
+    positions: Array,
+    headings: Array,
+    goals: Array,
+    obstacles: Array,
+    stride: float,
+    turn: float,
+    wants: Wants,
+    rounds: int,
+    pace: float,
+) -> None:
+    """Improve the plan of one flock in place by rounds of Adam on :func:`slope`, summed over the steps ahead.
+
+    :param plan: controls of every vehicle in every step ahead, ``(vehicles, steps, 2)``, relative to their bounds
+    :param positions: where vehicles are, ``(vehicles, 2)`` [m]
+    :param headings: where they look, ``(vehicles,)`` [rad]
+    :param goals: where each should be after each step, ``(steps, vehicles, 2)`` [m]
+    :param obstacles: where obstacles will be then, ``(steps, obstacles, 2)`` [m]
+    :param stride: longest way of a step [m]
+    :param turn: largest turn of a step [rad]
+    :param pace: how far a control moves in the first round at most, relative to its bound; in the last one 30 % of it
+    """
+    n, looks, _ = plan.shape
+    cos, sin, ways = np.empty((n, looks)), np.empty((n, looks)), np.empty((looks, n, 2))
+    down = np.empty((looks, n, 2))
+    mean, square = np.zeros((n, looks, 2)), np.zeros((n, looks, 2))
+    for k in range(rounds):
+        for i in range(n):
+            heading, x, y = headings[i], positions[i, 0], positions[i, 1]
+            for t in range(looks):
+                cos[i, t], sin[i, t] = math.cos(heading), math.sin(heading)
+                x += plan[i, t, 0] * stride * cos[i, t]
+                y += plan[i, t, 0] * stride * sin[i, t]
+                heading += plan[i, t, 1] * turn
+                ways[t, i, 0], ways[t, i, 1] = x, y
+        for t in range(looks):
+            slope(down[t], ways[t], goals[t], obstacles[t], wants)
+        step = pace * (1.0 - 0.7 * (k + 1) / rounds)
+        for i in range(n):
+            to_x = to_y = to_heading = 0.0  # slopes of all that comes after a step
+            for t in range(looks - 1, -1, -1):
+                to_x += down[t, i, 0]
+                to_y += down[t, i, 1]
+                along = (to_x * cos[i, t] + to_y * sin[i, t]) * stride
+                across = (to_y * cos[i, t] - to_x * sin[i, t]) * stride
+                for control, value in enumerate((along, to_heading * turn)):
+                    mean[i, t, control] = 0.8 * mean[i, t, control] + 0.2 * value
+                    square[i, t, control] = 0.95 * square[i, t, control] + 0.05 * value * value
+                    size = math.sqrt(square[i, t, control] / (1.0 - 0.95 ** (k + 1))) + 0.02
+                    moved = plan[i, t, control] - step * mean[i, t, control] / (1.0 - 0.8 ** (k + 1)) / size
+                    plan[i, t, control] = min(max(moved, -float(control)), 1.0)
+                # Who stands does not move by turning; as if it crept: else one that looks away would never turn round.
+                to_heading += across * max(plan[i, t, 0], 0.5)
+
+
+@njit(error_model="numpy", cache=True)
+def slope(down: Array, ways: Array, goals: Array, obstacles: Array, wants: Wants) -> None:
+    """The slope ``down`` ``(vehicles, 2)`` of a step's cost by the positions ``ways`` ``(vehicles, 2)`` [m].
+
+    The cost is the mean distance to the goals and half the weighed squares of what is missing: of distances to neighbors and
+    obstacles, and of the links in the shortest tree that joins the flock, of these up to 0.1 m.
+    """
+    n = len(ways)
+    for i in range(n):
+        x, y = ways[i, 0] - goals[i, 0], ways[i, 1] - goals[i, 1]
+        distance = math.sqrt(x * x + y * y + 0.02**2)  # smooth where a vehicle is at its goal
+        down[i, 0], down[i, 1] = x / distance / n, y / distance / n
+        for obstacle in obstacles:
+            x, y = ways[i, 0] - obstacle[0], ways[i, 1] - obstacle[1]
+            distance = math.sqrt(x * x + y * y) + 1e-9
+            push = wants.clearance_weight * max(0.0, wants.clearance - distance) / distance
+            down[i, 0] -= push * x
+            down[i, 1] -= push * y
+        for j in range(i):
+            distance = _distance(ways, i, j)
+            _pull(down, ways, i, j, -wants.separation_weight * max(0.0, wants.separation - distance) / distance)
+    nearest, at, joined = np.full(n, np.inf), np.zeros(n, np.int64), np.zeros(n, np.bool_)
+    last = 0
+    for _ in range(n - 1):  # Prim's algorithm
+        joined[last] = True
+        best = -1
+        for j in range(n):
+            if not joined[j]:
+                distance = _distance(ways, j, last)
+                if distance < nearest[j]:
+                    nearest[j], at[j] = distance, last
+                if best < 0 or nearest[j] < nearest[best]:
+                    best = j
+        last = best
+        _pull(
+            down, ways, last, at[last], wants.reach_weight * min(max(0.0, nearest[last] - wants.reach), 0.1) / nearest[last]
+        )
+
+
+@njit(error_model="numpy", cache=True)
+def _distance(ways: Array, i: int, j: int) -> float:
+    x, y = ways[i, 0] - ways[j, 0], ways[i, 1] - ways[j, 1]
+    return math.sqrt(x * x + y * y) + 1e-9
+
+
+@njit(error_model="numpy", cache=True)
+def _pull(down: Array, ways: Array, i: int, j: int, pull: float) -> None:
+    for axis in range(2):
+        difference = pull * (ways[i, axis] - ways[j, axis])
+        down[i, axis] += difference
+        down[j, axis] -= difference

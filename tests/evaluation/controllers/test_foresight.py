@@ -1,0 +1,105 @@
+import sys
+
+import numpy as np
+import pytest
+
+from sb3_flock import Scenario
+from sb3_flock.evaluation.controllers import CONTROLLERS, Foresight
+from sb3_flock.evaluation.episodes import fly_together
+from sb3_flock.settings import SettingsError
+from sb3_flock.sim import World, episode_rng
+
+pytest.importorskip("numba")
+pytest.importorskip("scipy")
+
+from sb3_flock.evaluation.controllers.descent import Wants, slope
+
+
+def cost(ways, goals, obstacles, wants):
+    """What :func:`slope` is the slope of, written down plainly."""
+    between = np.linalg.norm(ways[:, None] - ways, axis=-1)
+    pairs = between[np.triu_indices(len(ways), 1)]
+    away = np.linalg.norm(ways[:, None] - obstacles, axis=-1)
+    inside, missing = {0}, 0.0
+    while len(inside) < len(ways):  # the shortest tree, by its next shortest link
+        link, new = min((between[i, j], j) for i in inside for j in range(len(ways)) if j not in inside)
+        inside.add(new)
+        missing += max(0.0, link - wants.reach) ** 2
+    return (
+        np.sqrt(((ways - goals) ** 2).sum(-1) + 0.02**2).mean()
+        + wants.separation_weight / 2 * (np.maximum(0.0, wants.separation - pairs) ** 2).sum()
+        + wants.clearance_weight / 2 * (np.maximum(0.0, wants.clearance - away) ** 2).sum()
+        + wants.reach_weight / 2 * missing
+    )
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_slope_is_that_of_the_cost(seed):
+    rng, wants = np.random.default_rng(seed), Wants(0.11, 0.16, 0.12)
+    ways, goals, obstacles = (rng.uniform(-size, size, (count, 2)) for size, count in ((0.12, 5), (0.05, 5), (0.3, 2)))
+    down, numeric = np.empty((5, 2)), np.empty((5, 2))
+    slope(down, ways, goals, obstacles, wants)
+    for i, axis in np.ndindex(5, 2):
+        nudge = np.zeros((5, 2))
+        nudge[i, axis] = 1e-6
+        numeric[i, axis] = (cost(ways + nudge, goals, obstacles, wants) - cost(ways - nudge, goals, obstacles, wants)) / 2e-6
+    np.testing.assert_allclose(down, numeric, rtol=1e-4, atol=1e-5)
+
+
+def begun(scenario, episodes=1):
+    world, rngs = World(scenario, episodes), [episode_rng(0, episode) for episode in range(episodes)]
+    return world, world.reset(rngs)
+
+
+def test_only_the_state_decides():
+    task = Scenario(n_vehicles=5, n_obstacles=2)
+    world, sensing = begun(task, 3)
+    veteran = Foresight(world)
+    for _ in range(30):
+        sensing, _ = world.step(veteran.act(sensing, task))
+    np.testing.assert_array_equal(veteran.act(sensing, task), Foresight(world).act(sensing, task))
+
+
+def test_what_no_vehicle_detects_is_not_known_of():
+    task = Scenario(n_vehicles=3, n_obstacles=1)
+    world, sensing = begun(task)
+    world.positions, world.headings = np.array([[[0.0, 0.0], [0.0, 0.12], [-0.12, 0.0]]]), np.zeros((1, 3))
+    world.waypoints, teacher = np.array([[1.0, 0.0]]), Foresight(world)
+    advice = []
+    for x in (0.2, task.detection_range + 0.01, 0.5):
+        world.obstacle_positions, world.obstacle_headings = np.array([[[x, 0.0]]]), np.array([[np.pi]])
+        advice.append(teacher.act(sensing, task))
+    np.testing.assert_array_equal(advice[1], advice[2])
+    assert np.abs(advice[0] - advice[1]).max() > 0.1
+
+
+def test_a_lone_vehicle_turns_round_meets_the_waypoint_and_stays_with_it():
+    task = Scenario(n_vehicles=1, n_obstacles=0, waypoint_route=[(0.0, 0.0), (3.0, 0.0)])
+    world, sensing = begun(task)
+    world.positions, world.headings = np.array([[[-0.3, 0.0]]]), np.array([[np.pi]])
+    teacher = Foresight(world)
+    for _ in range(150):
+        sensing, _ = world.step(teacher.act(sensing, task))
+    assert sensing.waypoint_distances.item() < 0.04  # its place is in a lattice around the waypoint
+    assert world.waypoints[0, 0] > 1.0
+
+
+def flown(pilot, scenario, episodes):
+    results = fly_together(pilot, scenario, [episode_rng(5, episode) for episode in range(episodes)])
+    return {name: np.nanmean(values) for name, values in results.items()}
+
+
+def test_its_flocks_stand_close_keep_their_distances_and_hold_together():
+    found = flown(Foresight, Scenario(n_vehicles=5, n_obstacles=2), 10)
+    assert found["tracking_error"] < 0.09
+    assert found["connectivity"] > 0.99
+    assert found["neighbor_violation_rate"] < 0.002
+    assert found["obstacle_violation_rate"] < 0.01
+
+
+def test_who_sees_everything_is_no_peer_and_a_missing_library_is_told_in_one_line(monkeypatch):
+    assert "foresight" not in CONTROLLERS
+    monkeypatch.delitem(sys.modules, "sb3_flock.evaluation.controllers.descent")
+    monkeypatch.setitem(sys.modules, "numba", None)
+    with pytest.raises(SettingsError, match=r"teacher = 'foresight': needs numba, pip install 'sb3_flock\[fast\]'"):
+        Foresight(World(Scenario()))
