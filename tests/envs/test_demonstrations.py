@@ -61,14 +61,15 @@ def test_it_flies_its_share_of_the_episodes_with_its_noise():
     assert actions.std(axis=0).min() > 0.01
 
 
-def test_an_adviser_says_in_every_step_what_it_would_do_there():
-    env = DemonstratedEnv(CROWD, TEACHERS["planner"], share=0.5, noise=0.1, advises=True)
+@pytest.mark.parametrize("adviser", ["planner", "foresight"])
+def test_an_adviser_says_in_every_step_what_it_would_do_there(adviser):
+    env = DemonstratedEnv(CROWD, TEACHERS[adviser], share=0.5, noise=0.1, advises=True)
     rng = np.random.default_rng(0)
     kinds = set()
     for seed in range(5, 10):
         env.reset(seed=seed)
         world = World(CROWD)
-        teacher = TEACHERS["planner"](world)
+        teacher = TEACHERS[adviser](world)
         for _ in range(CROWD.max_cycles):
             world.load_state_dict(env.world.state_dict())
             teacher.load_state_dict(env.state_dict()["taught"]["memory"])
@@ -154,7 +155,7 @@ def test_mistakes_are_one_line(tmp_path):
     for name, value in (("teacher", "random"), ("teacher_share", 1.1), ("teacher_noise", -0.1)):
         with pytest.raises(SettingsError, match=f"{name} = "):
             tiny(tmp_path, **{f"practice.{name}": value})
-    needed = "guidance = 0.5: input should be 0 without practice.teacher orca or planner, algo ddpg and n_steps 1"
+    needed = "guidance = 0.5: input should be 0 without practice.teacher orca, planner or foresight, algo ddpg and n_steps 1"
     for changes in ({}, {"teacher": "olfati-saber"}, {"teacher": "orca", "algo": "td3"}, {"teacher": "orca", "n_steps": 3}):
         with pytest.raises(SettingsError, match=needed):
             tiny(tmp_path, guidance=0.5, **changes)

@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 
 
 class Wants(NamedTuple):
-    """What plans should keep, and what it weighs [1/m] beside a mean meter to the goals."""
+    """What plans should keep, and what it weighs [1/m] beside a mean meter to the waypoint."""
 
     separation: float
     """Distance between vehicles [m]."""
@@ -31,7 +31,7 @@ def descend(
     plan: Array,
     positions: Array,
     headings: Array,
-    goals: Array,
+    waypoints: Array,
     obstacles: Array,
     stride: float,
     turn: float,
@@ -44,16 +44,20 @@ def descend(
     :param plan: controls of every vehicle in every step ahead, ``(vehicles, steps, 2)``, relative to their bounds
     :param positions: where vehicles are, ``(vehicles, 2)`` [m]
     :param headings: where they look, ``(vehicles,)`` [rad]
-    :param goals: where each should be after each step, ``(steps, vehicles, 2)`` [m]
+    :param waypoints: where the waypoint will be after each step, ``(steps, 2)`` [m]
     :param obstacles: where obstacles will be then, ``(steps, obstacles, 2)`` [m]
     :param stride: longest way of a step [m]
     :param turn: largest turn of a step [rad]
-    :param pace: how far a control moves in the first round at most, relative to its bound; in the last one 30 % of it
+    :param pace: how far a control moves in the first round at most, relative to its bound; in the last one a tenth of it
     """
     n, looks, _ = plan.shape
     cos, sin, ways = np.empty((n, looks)), np.empty((n, looks)), np.empty((looks, n, 2))
-    down = np.empty((looks, n, 2))
-    mean, square = np.zeros((n, looks, 2)), np.zeros((n, looks, 2))
+    down, slopes = np.empty((looks, n, 2)), np.empty((n, looks, 2))
+    flat, flat_slopes = plan.reshape(-1), slopes.reshape(-1)
+    mean, square = np.zeros(plan.size), np.zeros(plan.size)
+    low = np.zeros(plan.size)
+    low[1::2] = -1.0
+    fade, fade_square = 1.0, 1.0
     for k in range(rounds):
         for i in range(n):
             heading, x, y = headings[i], positions[i, 0], positions[i, 1]
@@ -64,36 +68,36 @@ def descend(
                 heading += plan[i, t, 1] * turn
                 ways[t, i, 0], ways[t, i, 1] = x, y
         for t in range(looks):
-            slope(down[t], ways[t], goals[t], obstacles[t], wants)
-        step = pace * (1.0 - 0.7 * (k + 1) / rounds)
+            slope(down[t], ways[t], waypoints[t], obstacles[t], wants)
         for i in range(n):
             to_x = to_y = to_heading = 0.0  # slopes of all that comes after a step
             for t in range(looks - 1, -1, -1):
                 to_x += down[t, i, 0]
                 to_y += down[t, i, 1]
-                along = (to_x * cos[i, t] + to_y * sin[i, t]) * stride
-                across = (to_y * cos[i, t] - to_x * sin[i, t]) * stride
-                for control, value in enumerate((along, to_heading * turn)):
-                    mean[i, t, control] = 0.8 * mean[i, t, control] + 0.2 * value
-                    square[i, t, control] = 0.95 * square[i, t, control] + 0.05 * value * value
-                    size = math.sqrt(square[i, t, control] / (1.0 - 0.95 ** (k + 1))) + 0.02
-                    moved = plan[i, t, control] - step * mean[i, t, control] / (1.0 - 0.8 ** (k + 1)) / size
-                    plan[i, t, control] = min(max(moved, -float(control)), 1.0)
+                slopes[i, t, 0] = (to_x * cos[i, t] + to_y * sin[i, t]) * stride
+                slopes[i, t, 1] = to_heading * turn
                 # Who stands does not move by turning; as if it crept: else one that looks away would never turn round.
-                to_heading += across * max(plan[i, t, 0], 0.5)
+                to_heading += (to_y * cos[i, t] - to_x * sin[i, t]) * stride * max(plan[i, t, 0], 0.5)
+        fade *= 0.8
+        fade_square *= 0.9
+        step, share = pace * (1.0 - 0.9 * (k + 1) / rounds) / (1.0 - fade), 1.0 / (1.0 - fade_square)
+        for i in range(plan.size):
+            mean[i] = 0.8 * mean[i] + 0.2 * flat_slopes[i]
+            square[i] = 0.9 * square[i] + 0.1 * flat_slopes[i] * flat_slopes[i]
+            flat[i] = min(max(flat[i] - step * mean[i] / (math.sqrt(square[i] * share) + 0.005), low[i]), 1.0)
 
 
 @njit(error_model="numpy", cache=True)
-def slope(down: Array, ways: Array, goals: Array, obstacles: Array, wants: Wants) -> None:
+def slope(down: Array, ways: Array, waypoint: Array, obstacles: Array, wants: Wants) -> None:
     """The slope ``down`` ``(vehicles, 2)`` of a step's cost by the positions ``ways`` ``(vehicles, 2)`` [m].
 
-    The cost is the mean distance to the goals and half the weighed squares of what is missing: of distances to neighbors and
+    The cost is the mean distance to the waypoint and half the weighed squares of what is missing: of distances to neighbors and
     obstacles, and of the links in the shortest tree that joins the flock, of these up to 0.1 m.
     """
     n = len(ways)
     for i in range(n):
-        x, y = ways[i, 0] - goals[i, 0], ways[i, 1] - goals[i, 1]
-        distance = math.sqrt(x * x + y * y + 0.02**2)  # smooth where a vehicle is at its goal
+        x, y = ways[i, 0] - waypoint[0], ways[i, 1] - waypoint[1]
+        distance = math.sqrt(x * x + y * y + 0.02**2)  # smooth where a vehicle is on it
         down[i, 0], down[i, 1] = x / distance / n, y / distance / n
         for obstacle in obstacles:
             x, y = ways[i, 0] - obstacle[0], ways[i, 1] - obstacle[1]

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from sb3_flock.evaluation.controllers.planner import Places, PlannerGains
 from sb3_flock.settings import SettingsError
 from sb3_flock.sim import Scenario, Sensing, World
 from sb3_flock.sim.sensing import nearest
@@ -23,33 +21,33 @@ Array = NDArray[np.float64]
 class ForesightGains:
     """What is free in foresight."""
 
-    places: PlannerGains = field(default_factory=partial(PlannerGains, spacing=1.05))
-    """How places are chosen."""
     separation: float = 1.06
     """Distance between vehicles that plans keep, relative to the minimum separation to neighbors."""
     clearance: float = 1.033
     """Distance to obstacles that plans keep, relative to the minimum separation to them."""
     reach: float = 0.93
     """Length of links that plans keep, relative to the link range."""
+    sight: float = 1.0
+    """Distance from a vehicle at which an obstacle is known of, relative to the detection range."""
     steps: int = 20
     """Steps planned ahead."""
     rounds: int = 200
     """Rounds of descent."""
-    pace: float = 0.03
+    pace: float = 0.06
     """How far a control moves in the first round at most, relative to its bound."""
 
 
 class Foresight:
     """Plans the controls of all vehicles together, as the unicycles they are, and advises the first ones.
 
-    Each is to come to its place of :class:`~sb3_flock.evaluation.controllers.planner.Places`, beside the waypoint on its way
-    ahead; all are to keep their distances to each other and to obstacles, and the flock its links. Obstacles that no vehicle
-    detects are not known of; the others are expected to walk straight on at their mean speed. Every plan begins with standing
-    still, so the state alone decides, nothing that was planned before: that is what a policy can imitate.
+    All are to stay with the waypoint on its way ahead, to keep their distances to each other and to obstacles, and the flock its
+    links. Obstacles that no vehicle detects are not known of; the others are expected to walk straight on at their mean speed.
+    Every plan begins with standing still, so the state alone decides, nothing that was planned before: that is what a policy
+    can imitate.
 
     :param world: the world that it sees, whatever is sensed in it
     :param gains: found by a few trials
-    :raises SettingsError: if ``numba`` or ``scipy`` is not installed
+    :raises SettingsError: if ``numba`` is not installed
     """
 
     def __init__(self, world: World, gains: ForesightGains | None = None) -> None:
@@ -59,8 +57,6 @@ class Foresight:
             raise SettingsError("teacher = 'foresight': needs numba, pip install 'sb3_flock[fast]'") from None
         self.world, self.gains, self._descend = world, gains or ForesightGains(), descend
         scenario = world.scenario
-        self.places = Places(scenario, self.gains.places)
-        self._steps = np.arange(1, self.gains.steps + 1)
         self._wants = Wants(
             self.gains.separation * scenario.neighbor_separation,
             self.gains.clearance * scenario.obstacle_separation,
@@ -72,35 +68,19 @@ class Foresight:
 
     def act(self, sensing: Sensing, scenario: Scenario) -> Array:
         """The first controls of the plans."""
-        world, known = self.world, self.known(scenario.detection_range)
-        plans = np.zeros((world.n_flocks, scenario.n_vehicles, self.gains.steps, 2))
-        self.improve(plans, self.courses()[:, :, None] + self.places.given(world, known)[:, None], known)
-        return plans[:, :, 0] * world.action_high
-
-    def courses(self) -> Array:
-        """Where the waypoint will be after each step planned ahead, ``(flocks, steps, 2)`` [m]."""
-        return self.world.waypoints_after(np.broadcast_to(self._steps, (self.world.n_flocks, self.gains.steps)))
-
-    def known(self, sight: float) -> NDArray[np.bool_]:
-        """The obstacles nearer to some vehicle than ``sight`` [m], ``(flocks, obstacles)``."""
-        return nearest(self.world.obstacle_positions, self.world.positions) < sight
-
-    def improve(self, plans: Array, goals: Array, known: NDArray[np.bool_]) -> None:
-        """Improve plans in place.
-
-        :param plans: controls relative to their bounds, ``(flocks, vehicles, steps, 2)``
-        :param goals: where each vehicle should be after each step, ``(flocks, steps, vehicles, 2)`` [m]
-        :param known: :meth:`known`; other obstacles are not minded
-        """
         world, gains = self.world, self.gains
+        steps = np.arange(1, gains.steps + 1)
+        waypoints = world.waypoints_after(np.broadcast_to(steps, (world.n_flocks, gains.steps)))
         headings = np.stack((np.cos(world.obstacle_headings), np.sin(world.obstacle_headings)), axis=-1)
-        strides = world.obstacle_speeds.mean(0)[..., None] * headings * world.scenario.time_step
-        obstacles = world.obstacle_positions[:, None] + strides[:, None] * self._steps[:, None, None]
-        stride, turn = world.action_high * world.scenario.time_step
+        strides = world.obstacle_speeds.mean(0)[..., None] * headings * scenario.time_step
+        obstacles = world.obstacle_positions[:, None] + strides[:, None] * steps[:, None, None]
+        known = nearest(world.obstacle_positions, world.positions) < gains.sight * scenario.detection_range
+        stride, turn = world.action_high * scenario.time_step
+        plans = np.zeros((world.n_flocks, scenario.n_vehicles, gains.steps, 2))
         for flock, plan in enumerate(plans):
-            start = world.positions[flock], world.headings[flock]
-            seen = obstacles[flock][:, known[flock]]
-            self._descend(plan, *start, goals[flock], seen, stride, turn, self._wants, gains.rounds, gains.pace)
+            start, seen = (world.positions[flock], world.headings[flock]), obstacles[flock][:, known[flock]]
+            self._descend(plan, *start, waypoints[flock], seen, stride, turn, self._wants, gains.rounds, gains.pace)
+        return plans[:, :, 0] * world.action_high
 
     def state_dict(self) -> dict[str, Any]:
         """Nothing is remembered."""

@@ -56,7 +56,7 @@ class Planner:
     def __init__(self, world: World, gains: PlannerGains | None = None) -> None:
         self.world, self.gains = world, gains or PlannerGains()
         self.orca = Orca(OrcaGains(margin=0.002, approach=self.gains.approach))
-        self.places = Places(world.scenario, self.gains)
+        self.packs = Packs(world.scenario.n_vehicles, self.gains.spacing * world.scenario.neighbor_separation)
 
     def reset(self, rngs: Sequence[Generator], scenario: Scenario) -> None:
         """Forget the last episode."""
@@ -65,7 +65,7 @@ class Planner:
     def act(self, sensing: Sensing, scenario: Scenario) -> Array:
         """The actions that fly ORCA's velocities towards the places, as fast as these move besides."""
         world, gains = self.world, self.gains
-        places = self.places.given(world)
+        places = np.stack([self._places(flock) for flock in range(world.n_flocks)])
         offsets = places + self._meetings(places) - world.positions
         distances = np.hypot(offsets[..., 0], offsets[..., 1])[..., None]
         offsets = offsets * np.maximum(0.0, 1.0 - gains.tolerance / np.maximum(distances, 1e-9))
@@ -83,6 +83,19 @@ class Planner:
         """Go on from :meth:`state_dict`."""
         self.orca.load_state_dict(state)
 
+    def _places(self, flock: int) -> Array:
+        """A place for each vehicle ``(vehicles, 2)``, seen from the waypoint."""
+        world, scenario, gains = self.world, self.world.scenario, self.gains
+        vehicles, obstacles = (
+            bodies[flock] - world.waypoints[flock] for bodies in (world.positions, world.obstacle_positions)
+        )
+        clearance = gains.clearance * scenario.obstacle_separation
+        packs, distances = self.packs.free(obstacles, clearance)
+        places, ways = self.packs.given(packs, vehicles, obstacles, clearance)
+        flown = limit(places - vehicles, scenario.max_speed * _LOOKS[:, None, None])
+        apart = 1.0 - _connected(vehicles + flown, gains.hold * scenario.link_range).mean(0)
+        return places[np.argmin(distances + gains.way * ways + gains.apart * apart)]
+
     def _meetings(self, places: Array) -> Array:
         """Where the waypoint ``(flocks, vehicles, 2)`` will be when a vehicle can be at its place beside it.
 
@@ -95,41 +108,6 @@ class Planner:
             waypoints = world.waypoints_after(times / scenario.time_step)
             times = np.linalg.norm(waypoints + places - world.positions, axis=-1) / scenario.max_speed
         return waypoints
-
-
-class Places:
-    """Places around the waypoint, one for each vehicle: the packs of many lattices, and which of them suits a flock best.
-
-    :raises SettingsError: if ``scipy`` is not installed
-    """
-
-    def __init__(self, scenario: Scenario, gains: PlannerGains) -> None:
-        self.scenario, self.gains = scenario, gains
-        self.packs = Packs(scenario.n_vehicles, gains.spacing * scenario.neighbor_separation)
-
-    def given(self, world: World, known: NDArray[np.bool_] | None = None) -> Array:
-        """The places ``(flocks, vehicles, 2)`` [m], seen from the waypoint.
-
-        :param known: which obstacles are minded, ``(flocks, obstacles)``; the default is all
-        """
-        return np.stack(
-            [
-                self._given(
-                    world.positions[flock] - waypoint,
-                    world.obstacle_positions[flock][slice(None) if known is None else known[flock]] - waypoint,
-                )
-                for flock, waypoint in enumerate(world.waypoints)
-            ]
-        )
-
-    def _given(self, vehicles: Array, obstacles: Array) -> Array:
-        scenario, gains = self.scenario, self.gains
-        clearance = gains.clearance * scenario.obstacle_separation
-        packs, distances = self.packs.free(obstacles, clearance)
-        places, ways = self.packs.given(packs, vehicles, obstacles, clearance)
-        flown = limit(places - vehicles, scenario.max_speed * _LOOKS[:, None, None])
-        apart = 1.0 - _connected(vehicles + flown, gains.hold * scenario.link_range).mean(0)
-        return places[np.argmin(distances + gains.way * ways + gains.apart * apart)]
 
 
 _LOOKS = np.array([0.25, 0.5, 0.75, 1.0])
@@ -149,7 +127,7 @@ class Packs:
         try:
             from scipy.optimize import linear_sum_assignment
         except ImportError:
-            raise SettingsError("teacher = 'planner' or 'foresight': needs scipy, pip install 'sb3_flock[orca]'") from None
+            raise SettingsError("teacher = 'planner': needs scipy, pip install 'sb3_flock[orca]'") from None
         self._assign = linear_sum_assignment
         rng = np.random.default_rng(0)
         reach = int(np.ceil(np.sqrt(n_vehicles))) + 3

@@ -10,12 +10,11 @@ from sb3_flock.settings import SettingsError
 from sb3_flock.sim import World, episode_rng
 
 pytest.importorskip("numba")
-pytest.importorskip("scipy")
 
 from sb3_flock.evaluation.controllers.descent import Wants, slope
 
 
-def cost(ways, goals, obstacles, wants):
+def cost(ways, waypoint, obstacles, wants):
     """What :func:`slope` is the slope of, written down plainly."""
     between = np.linalg.norm(ways[:, None] - ways, axis=-1)
     pairs = between[np.triu_indices(len(ways), 1)]
@@ -26,7 +25,7 @@ def cost(ways, goals, obstacles, wants):
         inside.add(new)
         missing += max(0.0, link - wants.reach) ** 2
     return (
-        np.sqrt(((ways - goals) ** 2).sum(-1) + 0.02**2).mean()
+        np.sqrt(((ways - waypoint) ** 2).sum(-1) + 0.02**2).mean()
         + wants.separation_weight / 2 * (np.maximum(0.0, wants.separation - pairs) ** 2).sum()
         + wants.clearance_weight / 2 * (np.maximum(0.0, wants.clearance - away) ** 2).sum()
         + wants.reach_weight / 2 * missing
@@ -36,13 +35,15 @@ def cost(ways, goals, obstacles, wants):
 @pytest.mark.parametrize("seed", range(20))
 def test_the_slope_is_that_of_the_cost(seed):
     rng, wants = np.random.default_rng(seed), Wants(0.11, 0.16, 0.12)
-    ways, goals, obstacles = (rng.uniform(-size, size, (count, 2)) for size, count in ((0.12, 5), (0.05, 5), (0.3, 2)))
+    ways, obstacles, waypoint = (rng.uniform(-size, size, (count, 2)) for size, count in ((0.12, 5), (0.3, 2), (0.05, 1)))
     down, numeric = np.empty((5, 2)), np.empty((5, 2))
-    slope(down, ways, goals, obstacles, wants)
+    slope(down, ways, waypoint[0], obstacles, wants)
     for i, axis in np.ndindex(5, 2):
         nudge = np.zeros((5, 2))
         nudge[i, axis] = 1e-6
-        numeric[i, axis] = (cost(ways + nudge, goals, obstacles, wants) - cost(ways - nudge, goals, obstacles, wants)) / 2e-6
+        numeric[i, axis] = (
+            cost(ways + nudge, waypoint, obstacles, wants) - cost(ways - nudge, waypoint, obstacles, wants)
+        ) / 2e-6
     np.testing.assert_allclose(down, numeric, rtol=1e-4, atol=1e-5)
 
 
@@ -80,7 +81,7 @@ def test_a_lone_vehicle_turns_round_meets_the_waypoint_and_stays_with_it():
     teacher = Foresight(world)
     for _ in range(150):
         sensing, _ = world.step(teacher.act(sensing, task))
-    assert sensing.waypoint_distances.item() < 0.04  # its place is in a lattice around the waypoint
+    assert sensing.waypoint_distances.item() < 0.01
     assert world.waypoints[0, 0] > 1.0
 
 
@@ -91,7 +92,7 @@ def flown(pilot, scenario, episodes):
 
 def test_its_flocks_stand_close_keep_their_distances_and_hold_together():
     found = flown(Foresight, Scenario(n_vehicles=5, n_obstacles=2), 10)
-    assert found["tracking_error"] < 0.09
+    assert found["tracking_error"] < 0.085
     assert found["connectivity"] > 0.99
     assert found["neighbor_violation_rate"] < 0.002
     assert found["obstacle_violation_rate"] < 0.01

@@ -104,7 +104,7 @@ def test_a_flock_holds_together_on_its_way_where_it_can():
         world.positions, world.obstacle_positions = vehicles[None], rng.uniform(-0.2, 0.2, (1, 2, 2))
         whole = []
         for planner in (careless, careful):
-            offsets = planner.places.given(world)[0] - vehicles
+            offsets = planner._places(0) - vehicles
             lengths = np.linalg.norm(offsets, axis=-1, keepdims=True)
             later = [vehicles + offsets * np.minimum(1.0, way / lengths) for way in (0.0375, 0.075, 0.1125, 0.15)]
             whole.append(sum(bool(_connected(looked, 0.9 * task.link_range)) for looked in later))
@@ -144,7 +144,7 @@ def test_a_vehicle_on_its_place_rests():
     for _ in range(task.max_cycles):
         actions = planner.act(sensing, task)
         sensing, _ = world.step(actions)
-    nearest = planner.places.packs.free(world.obstacle_positions[0], 0.15)[1].min()
+    nearest = planner.packs.free(world.obstacle_positions[0], 0.15)[1].min()
     assert sensing.waypoint_distances.item() == pytest.approx(nearest, abs=2 * planner.gains.tolerance)
     np.testing.assert_allclose(actions, 0, atol=1e-3)
 
@@ -152,7 +152,5 @@ def test_a_vehicle_on_its_place_rests():
 def test_who_sees_everything_is_no_peer_and_a_missing_library_is_told_in_one_line(monkeypatch):
     assert "planner" not in CONTROLLERS
     monkeypatch.setitem(sys.modules, "scipy.optimize", None)
-    with pytest.raises(
-        SettingsError, match=r"teacher = 'planner' or 'foresight': needs scipy, pip install 'sb3_flock\[orca\]'"
-    ):
+    with pytest.raises(SettingsError, match=r"teacher = 'planner': needs scipy, pip install 'sb3_flock\[orca\]'"):
         Planner(World(Scenario()))
