@@ -17,6 +17,8 @@ class Wants(NamedTuple):
 
     separation: float
     """Distance between vehicles [m]."""
+    clearance: float
+    """Distance to obstacles [m]."""
     reach: float
     """Length of the links that join the flock [m]."""
     separation_weight: float = 500.0
@@ -31,7 +33,6 @@ def descend(
     headings: Array,
     waypoints: Array,
     obstacles: Array,
-    clearances: Array,
     stride: float,
     turn: float,
     wants: Wants,
@@ -45,7 +46,6 @@ def descend(
     :param headings: where they look, ``(vehicles,)`` [rad]
     :param waypoints: where the waypoint will be after each step, ``(steps, 2)`` [m]
     :param obstacles: where obstacles will be then, ``(steps, obstacles, 2)`` [m]
-    :param clearances: distances to keep from them, ``(obstacles,)`` [m]
     :param stride: longest way of a step [m]
     :param turn: largest turn of a step [rad]
     :param pace: how far a control moves in the first round at most, relative to its bound; in the last one a tenth of it
@@ -68,7 +68,7 @@ def descend(
                 heading += plan[i, t, 1] * turn
                 ways[t, i, 0], ways[t, i, 1] = x, y
         for t in range(looks):
-            slope(down[t], ways[t], waypoints[t], obstacles[t], clearances, wants)
+            slope(down[t], ways[t], waypoints[t], obstacles[t], wants)
         for i in range(n):
             to_x = to_y = to_heading = 0.0  # slopes of all that comes after a step
             for t in range(looks - 1, -1, -1):
@@ -88,7 +88,7 @@ def descend(
 
 
 @njit(error_model="numpy", cache=True)
-def slope(down: Array, ways: Array, waypoint: Array, obstacles: Array, clearances: Array, wants: Wants) -> None:
+def slope(down: Array, ways: Array, waypoint: Array, obstacles: Array, wants: Wants) -> None:
     """The slope ``down`` ``(vehicles, 2)`` of a step's cost by the positions ``ways`` ``(vehicles, 2)`` [m].
 
     The cost is the mean distance to the waypoint and half the weighed squares of what is missing: of distances to neighbors and
@@ -99,10 +99,10 @@ def slope(down: Array, ways: Array, waypoint: Array, obstacles: Array, clearance
         x, y = ways[i, 0] - waypoint[0], ways[i, 1] - waypoint[1]
         distance = math.sqrt(x * x + y * y + 0.02**2)  # smooth where a vehicle is on it
         down[i, 0], down[i, 1] = x / distance / n, y / distance / n
-        for k in range(len(obstacles)):
-            x, y = ways[i, 0] - obstacles[k, 0], ways[i, 1] - obstacles[k, 1]
+        for obstacle in obstacles:
+            x, y = ways[i, 0] - obstacle[0], ways[i, 1] - obstacle[1]
             distance = math.sqrt(x * x + y * y) + 1e-9
-            push = wants.clearance_weight * max(0.0, clearances[k] - distance) / distance
+            push = wants.clearance_weight * max(0.0, wants.clearance - distance) / distance
             down[i, 0] -= push * x
             down[i, 1] -= push * y
         for j in range(i):

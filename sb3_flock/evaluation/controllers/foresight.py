@@ -25,8 +25,6 @@ class ForesightGains:
     """Distance between vehicles that plans keep, relative to the minimum separation to neighbors."""
     clearance: float = 1.033
     """Distance to obstacles that plans keep, relative to the minimum separation to them."""
-    widening: float = 0.08
-    """How much wider an obstacle counts on the side of its course that is away from the waypoint [m]."""
     reach: float = 0.93
     """Length of links that plans keep, relative to the link range."""
     sight: float = 1.0
@@ -61,6 +59,7 @@ class Foresight:
         scenario = world.scenario
         self._wants = Wants(
             self.gains.separation * scenario.neighbor_separation,
+            self.gains.clearance * scenario.obstacle_separation,
             self.gains.reach * scenario.link_range,
         )
 
@@ -72,32 +71,16 @@ class Foresight:
         world, gains = self.world, self.gains
         steps = np.arange(1, gains.steps + 1)
         waypoints = world.waypoints_after(np.broadcast_to(steps, (world.n_flocks, gains.steps)))
-        obstacles, clearances = self._obstacles(steps)
+        headings = np.stack((np.cos(world.obstacle_headings), np.sin(world.obstacle_headings)), axis=-1)
+        strides = world.obstacle_speeds.mean(0)[..., None] * headings * scenario.time_step
+        obstacles = world.obstacle_positions[:, None] + strides[:, None] * steps[:, None, None]
         known = nearest(world.obstacle_positions, world.positions) < gains.sight * scenario.detection_range
         stride, turn = world.action_high * scenario.time_step
         plans = np.zeros((world.n_flocks, scenario.n_vehicles, gains.steps, 2))
         for flock, plan in enumerate(plans):
-            start, which = (world.positions[flock], world.headings[flock]), known[flock]
-            seen = obstacles[flock][:, which], clearances[flock][which]
-            self._descend(plan, *start, waypoints[flock], *seen, stride, turn, self._wants, gains.rounds, gains.pace)
+            start, seen = (world.positions[flock], world.headings[flock]), obstacles[flock][:, known[flock]]
+            self._descend(plan, *start, waypoints[flock], seen, stride, turn, self._wants, gains.rounds, gains.pace)
         return plans[:, :, 0] * world.action_high
-
-    def _obstacles(self, steps: NDArray[np.int64]) -> tuple[Array, Array]:
-        """Where obstacles are expected ``(flocks, steps, obstacles, 2)`` and the distances to keep ``(flocks, obstacles)`` [m].
-
-        One that comes towards a waypoint near by is wider on the side of its course away from the waypoint. All who see it
-        can know which one that is, and the flock lets it pass there, in one piece.
-        """
-        world, scenario, gains = self.world, self.world.scenario, self.gains
-        along = np.stack((np.cos(world.obstacle_headings), np.sin(world.obstacle_headings)), axis=-1)
-        aside = np.stack((-along[..., 1], along[..., 0]), axis=-1)
-        offsets = world.waypoints[:, None] - world.obstacle_positions
-        ahead, beside, distances = (offsets * along).sum(-1), (offsets * aside).sum(-1), np.linalg.norm(offsets, axis=-1)
-        wider = gains.widening * np.clip(ahead / 0.15, 0.0, 1.0) * np.clip(2.0 - distances / 0.4, 0.0, 1.0)
-        strides = world.obstacle_speeds.mean(0)[..., None] * along * scenario.time_step
-        middles = world.obstacle_positions - (wider * np.sign(beside))[..., None] * aside
-        ways = middles[:, None] + strides[:, None] * steps[:, None, None]
-        return ways, gains.clearance * scenario.obstacle_separation + wider
 
     def state_dict(self) -> dict[str, Any]:
         """Nothing is remembered."""

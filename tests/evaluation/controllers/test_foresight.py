@@ -14,7 +14,7 @@ pytest.importorskip("numba")
 from sb3_flock.evaluation.controllers.descent import Wants, slope
 
 
-def cost(ways, waypoint, obstacles, clearances, wants):
+def cost(ways, waypoint, obstacles, wants):
     """What :func:`slope` is the slope of, written down plainly."""
     between = np.linalg.norm(ways[:, None] - ways, axis=-1)
     pairs = between[np.triu_indices(len(ways), 1)]
@@ -27,23 +27,23 @@ def cost(ways, waypoint, obstacles, clearances, wants):
     return (
         np.sqrt(((ways - waypoint) ** 2).sum(-1) + 0.02**2).mean()
         + wants.separation_weight / 2 * (np.maximum(0.0, wants.separation - pairs) ** 2).sum()
-        + wants.clearance_weight / 2 * (np.maximum(0.0, clearances - away) ** 2).sum()
+        + wants.clearance_weight / 2 * (np.maximum(0.0, wants.clearance - away) ** 2).sum()
         + wants.reach_weight / 2 * missing
     )
 
 
 @pytest.mark.parametrize("seed", range(20))
 def test_the_slope_is_that_of_the_cost(seed):
-    rng, wants = np.random.default_rng(seed), Wants(0.11, 0.12)
+    rng, wants = np.random.default_rng(seed), Wants(0.11, 0.16, 0.12)
     ways, obstacles, waypoint = (rng.uniform(-size, size, (count, 2)) for size, count in ((0.12, 5), (0.3, 2), (0.05, 1)))
-    clearances = np.array([0.16, 0.24])
     down, numeric = np.empty((5, 2)), np.empty((5, 2))
-    slope(down, ways, waypoint[0], obstacles, clearances, wants)
+    slope(down, ways, waypoint[0], obstacles, wants)
     for i, axis in np.ndindex(5, 2):
         nudge = np.zeros((5, 2))
         nudge[i, axis] = 1e-6
-        up, low = (cost(ways + sign * nudge, waypoint, obstacles, clearances, wants) for sign in (1, -1))
-        numeric[i, axis] = (up - low) / 2e-6
+        numeric[i, axis] = (
+            cost(ways + nudge, waypoint, obstacles, wants) - cost(ways - nudge, waypoint, obstacles, wants)
+        ) / 2e-6
     np.testing.assert_allclose(down, numeric, rtol=1e-4, atol=1e-5)
 
 
@@ -74,22 +74,6 @@ def test_what_no_vehicle_detects_is_not_known_of():
     assert np.abs(advice[0] - advice[1]).max() > 0.1
 
 
-def test_an_obstacle_that_comes_is_let_pass_on_the_side_away_from_the_waypoint():
-    task = Scenario(n_vehicles=1, n_obstacles=4, obstacle_motion="crossing")
-    world, _ = begun(task)
-    teacher = Foresight(world)
-    world.waypoints = np.array([[0.0, 0.02]])
-    world.obstacle_positions = np.array([[[-0.3, 0.0], [0.3, 0.04], [-0.3, 0.0], [-3.0, 0.0]]])
-    world.obstacle_headings = np.array([[0.0, np.pi, np.pi, 0.0]])  # coming, coming back, leaving, far away
-    ways, clearances = teacher._obstacles(np.array([0]))
-    usual, wide = 1.033 * task.obstacle_separation, teacher.gains.widening
-    np.testing.assert_allclose(clearances[0] - usual, [wide, wide, 0, 0], atol=1e-9)
-    np.testing.assert_allclose(ways[0, 0] - world.obstacle_positions[0], [[0, -wide], [0, wide], [0, 0], [0, 0]], atol=1e-9)
-    speeds = world.obstacle_speeds.mean(0)
-    further, _ = teacher._obstacles(np.array([10]))
-    np.testing.assert_allclose(np.linalg.norm(further - ways, axis=-1)[0, 0], speeds.reshape(-1) * 10 * task.time_step)
-
-
 def test_a_lone_vehicle_turns_round_meets_the_waypoint_and_stays_with_it():
     task = Scenario(n_vehicles=1, n_obstacles=0, waypoint_route=[(0.0, 0.0), (3.0, 0.0)])
     world, sensing = begun(task)
@@ -108,7 +92,7 @@ def flown(pilot, scenario, episodes):
 
 def test_its_flocks_stand_close_keep_their_distances_and_hold_together():
     found = flown(Foresight, Scenario(n_vehicles=5, n_obstacles=2), 10)
-    assert found["tracking_error"] < 0.087
+    assert found["tracking_error"] < 0.085
     assert found["connectivity"] > 0.99
     assert found["neighbor_violation_rate"] < 0.002
     assert found["obstacle_violation_rate"] < 0.01
