@@ -21,6 +21,8 @@ class Wants(NamedTuple):
     """Distance to obstacles [m]."""
     reach: float
     """Length of the links that join the flock [m]."""
+    slack: float = 0.1
+    """Longer by this much, a link is given up: who has lost the others finds them at the waypoint [m]."""
     separation_weight: float = 500.0
     clearance_weight: float = 1000.0
     reach_weight: float = 60.0
@@ -92,7 +94,8 @@ def slope(down: Array, ways: Array, waypoint: Array, obstacles: Array, wants: Wa
     """The slope ``down`` ``(vehicles, 2)`` of a step's cost by the positions ``ways`` ``(vehicles, 2)`` [m].
 
     The cost is the mean distance to the waypoint and half the weighed squares of what is missing: of distances to neighbors and
-    obstacles, and of the links in the shortest tree that joins the flock, of these up to 0.1 m.
+    obstacles, and of the links in the shortest tree that joins the flock. What a link lacks weighs less the more it is, and
+    nothing more beyond the slack.
     """
     n = len(ways)
     for i in range(n):
@@ -121,9 +124,9 @@ def slope(down: Array, ways: Array, waypoint: Array, obstacles: Array, wants: Wa
                 if best < 0 or nearest[j] < nearest[best]:
                     best = j
         last = best
-        _pull(
-            down, ways, last, at[last], wants.reach_weight * min(max(0.0, nearest[last] - wants.reach), 0.1) / nearest[last]
-        )
+        missing = max(0.0, nearest[last] - wants.reach)
+        pull = wants.reach_weight * missing * max(0.0, 1.0 - missing / wants.slack) ** 2
+        _pull(down, ways, last, at[last], pull / nearest[last])
 
 
 @njit(error_model="numpy", cache=True)

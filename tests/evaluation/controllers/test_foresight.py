@@ -23,12 +23,13 @@ def cost(ways, waypoint, obstacles, wants):
     while len(inside) < len(ways):  # the shortest tree, by its next shortest link
         link, new = min((between[i, j], j) for i in inside for j in range(len(ways)) if j not in inside)
         inside.add(new)
-        missing += max(0.0, link - wants.reach) ** 2
+        lack = min(max(0.0, link - wants.reach), wants.slack)
+        missing += lack**2 / 2 - 2 * lack**3 / (3 * wants.slack) + lack**4 / (4 * wants.slack**2)
     return (
         np.sqrt(((ways - waypoint) ** 2).sum(-1) + 0.02**2).mean()
         + wants.separation_weight / 2 * (np.maximum(0.0, wants.separation - pairs) ** 2).sum()
         + wants.clearance_weight / 2 * (np.maximum(0.0, wants.clearance - away) ** 2).sum()
-        + wants.reach_weight / 2 * missing
+        + wants.reach_weight * missing
     )
 
 
@@ -74,6 +75,16 @@ def test_what_no_vehicle_detects_is_not_known_of():
     assert np.abs(advice[0] - advice[1]).max() > 0.1
 
 
+def test_who_has_lost_the_others_goes_to_the_waypoint_and_not_to_them():
+    task = Scenario(n_vehicles=3, n_obstacles=0, waypoint_speed=0.0)
+    world, sensing = begun(task)
+    world.waypoints, world.headings, teacher = np.array([[1.0, 0.0]]), np.zeros((1, 3)), Foresight(world)
+    world.positions = np.array([[[0.0, 0.0], [0.0, 0.4], [0.0, -0.5]]])
+    np.testing.assert_allclose(teacher.act(sensing, task)[0, 0], [task.max_speed, 0.0], atol=1e-6)
+    world.positions[0, 1] = 0.0, 0.16
+    assert teacher.act(sensing, task)[0, 0, 1] > 0.1  # a link that is about to break
+
+
 def test_a_lone_vehicle_turns_round_meets_the_waypoint_and_stays_with_it():
     task = Scenario(n_vehicles=1, n_obstacles=0, waypoint_route=[(0.0, 0.0), (3.0, 0.0)])
     world, sensing = begun(task)
@@ -92,7 +103,7 @@ def flown(pilot, scenario, episodes):
 
 def test_its_flocks_stand_close_keep_their_distances_and_hold_together():
     found = flown(Foresight, Scenario(n_vehicles=5, n_obstacles=2), 10)
-    assert found["tracking_error"] < 0.085
+    assert found["tracking_error"] < 0.087
     assert found["connectivity"] > 0.99
     assert found["neighbor_violation_rate"] < 0.002
     assert found["obstacle_violation_rate"] < 0.01
