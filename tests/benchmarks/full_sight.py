@@ -30,7 +30,7 @@ CROSSING = Scenario(n_vehicles=5, n_obstacles=2, obstacle_motion="crossing")
 SEED = 1
 COLUMNS = ("tracking_error", "neighbor_violation_rate", "obstacle_violation_rate", "connectivity", "mean_separation")
 
-ALL = ForesightGains(separation=1.03, sight=np.inf, rounds=400)
+ALL = ForesightGains(separation=1.03, slack=6.0, sight=np.inf, rounds=400)
 """Foresight that knows of every obstacle and plans better than a training could wait for."""
 SHARED = replace(ALL, sight=1.0)
 

@@ -13,16 +13,19 @@ Array = NDArray[np.float64]
 
 
 class Wants(NamedTuple):
-    """What plans should keep, and what it weighs [1/m] beside a mean meter to the waypoint."""
+    """What plans should keep, and what it weighs beside the mean distance to the waypoint.
+
+    The weights are for lengths in the paper's meters, where a link is 0.15 long.
+    """
 
     separation: float
-    """Distance between vehicles [m]."""
+    """Distance between vehicles."""
     clearance: float
-    """Distance to obstacles [m]."""
+    """Distance to obstacles."""
     reach: float
-    """Length of the links that join the flock [m]."""
-    slack: float = 0.1
-    """Longer by this much, a link is given up: who has lost the others finds them at the waypoint [m]."""
+    """Length of the links that join the flock."""
+    slack: float
+    """Length beyond that at which a link no longer counts."""
     separation_weight: float = 500.0
     clearance_weight: float = 1000.0
     reach_weight: float = 60.0
@@ -44,11 +47,11 @@ def descend(
     """Improve the plan of one flock in place by rounds of Adam on :func:`slope`, summed over the steps ahead.
 
     :param plan: controls of every vehicle in every step ahead, ``(vehicles, steps, 2)``, relative to their bounds
-    :param positions: where vehicles are, ``(vehicles, 2)`` [m]
+    :param positions: where vehicles are, ``(vehicles, 2)``
     :param headings: where they look, ``(vehicles,)`` [rad]
-    :param waypoints: where the waypoint will be after each step, ``(steps, 2)`` [m]
-    :param obstacles: where obstacles will be then, ``(steps, obstacles, 2)`` [m]
-    :param stride: longest way of a step [m]
+    :param waypoints: where the waypoint will be after each step, ``(steps, 2)``
+    :param obstacles: where obstacles will be then, ``(steps, obstacles, 2)``
+    :param stride: longest way of a step
     :param turn: largest turn of a step [rad]
     :param pace: how far a control moves in the first round at most, relative to its bound; in the last one a tenth of it
     """
@@ -91,7 +94,7 @@ def descend(
 
 @njit(error_model="numpy", cache=True)
 def slope(down: Array, ways: Array, waypoint: Array, obstacles: Array, wants: Wants) -> None:
-    """The slope ``down`` ``(vehicles, 2)`` of a step's cost by the positions ``ways`` ``(vehicles, 2)`` [m].
+    """The slope ``down`` ``(vehicles, 2)`` of a step's cost by the positions ``ways`` ``(vehicles, 2)``.
 
     The cost is the mean distance to the waypoint and half the weighed squares of what is missing: of distances to neighbors and
     obstacles, and of the links in the shortest tree that joins the flock. What a link lacks weighs less the more it is, and

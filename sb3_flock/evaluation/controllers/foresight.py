@@ -27,6 +27,8 @@ class ForesightGains:
     """Distance to obstacles that plans keep, relative to the minimum separation to them."""
     reach: float = 0.93
     """Length of links that plans keep, relative to the link range."""
+    slack: float = 2 / 3
+    """Longer than that by this much [link ranges] a link is given up: who has lost the others finds them at the waypoint."""
     sight: float = 1.0
     """Distance from a vehicle at which an obstacle is known of, relative to the detection range."""
     steps: int = 20
@@ -57,10 +59,12 @@ class Foresight:
             raise SettingsError("teacher = 'foresight': needs numba, pip install 'sb3_flock[fast]'") from None
         self.world, self.gains, self._descend = world, gains or ForesightGains(), descend
         scenario = world.scenario
+        self._unit = scenario.link_range / 0.15  # of lengths, in which the weights are the same for tasks of all sizes [m]
         self._wants = Wants(
-            self.gains.separation * scenario.neighbor_separation,
-            self.gains.clearance * scenario.obstacle_separation,
-            self.gains.reach * scenario.link_range,
+            self.gains.separation * scenario.neighbor_separation / self._unit,
+            self.gains.clearance * scenario.obstacle_separation / self._unit,
+            self.gains.reach * 0.15,
+            self.gains.slack * 0.15,
         )
 
     def reset(self, rngs: Sequence[Generator], scenario: Scenario) -> None:
@@ -75,10 +79,11 @@ class Foresight:
         strides = world.obstacle_speeds.mean(0)[..., None] * headings * scenario.time_step
         obstacles = world.obstacle_positions[:, None] + strides[:, None] * steps[:, None, None]
         known = nearest(world.obstacle_positions, world.positions) < gains.sight * scenario.detection_range
-        stride, turn = world.action_high * scenario.time_step
+        positions, waypoints, obstacles = (points / self._unit for points in (world.positions, waypoints, obstacles))
+        stride, turn = world.action_high * scenario.time_step / (self._unit, 1.0)
         plans = np.zeros((world.n_flocks, scenario.n_vehicles, gains.steps, 2))
         for flock, plan in enumerate(plans):
-            start, seen = (world.positions[flock], world.headings[flock]), obstacles[flock][:, known[flock]]
+            start, seen = (positions[flock], world.headings[flock]), obstacles[flock][:, known[flock]]
             self._descend(plan, *start, waypoints[flock], seen, stride, turn, self._wants, gains.rounds, gains.pace)
         return plans[:, :, 0] * world.action_high
 

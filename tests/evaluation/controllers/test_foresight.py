@@ -35,7 +35,7 @@ def cost(ways, waypoint, obstacles, wants):
 
 @pytest.mark.parametrize("seed", range(20))
 def test_the_slope_is_that_of_the_cost(seed):
-    rng, wants = np.random.default_rng(seed), Wants(0.11, 0.16, 0.12)
+    rng, wants = np.random.default_rng(seed), Wants(0.11, 0.16, 0.12, 0.1)
     ways, obstacles, waypoint = (rng.uniform(-size, size, (count, 2)) for size, count in ((0.12, 5), (0.3, 2), (0.05, 1)))
     down, numeric = np.empty((5, 2)), np.empty((5, 2))
     slope(down, ways, waypoint[0], obstacles, wants)
@@ -60,6 +60,18 @@ def test_only_the_state_decides():
     for _ in range(30):
         sensing, _ = world.step(veteran.act(sensing, task))
     np.testing.assert_array_equal(veteran.act(sensing, task), Foresight(world).act(sensing, task))
+
+
+def test_a_task_of_another_size_is_the_same_task():
+    task = Scenario(n_vehicles=4, n_obstacles=2)
+    lengths = ("max_speed", "obstacle_max_speed", "waypoint_speed", "arena", "link_range")
+    ranges = ("neighbor_separation", "detection_range", "obstacle_separation", "goal_radius")
+    large = task.replace(**{name: 64 * getattr(task, name) for name in lengths + ranges})
+    (small, sensing), (other, others) = begun(task), begun(large)
+    for _ in range(60):
+        actions = Foresight(small).act(sensing, task)
+        np.testing.assert_allclose(Foresight(other).act(others, large), actions * [64, 1], rtol=1e-6, atol=1e-9)
+        (sensing, _), (others, _) = small.step(actions), other.step(actions * [64, 1])
 
 
 def test_what_no_vehicle_detects_is_not_known_of():
