@@ -104,7 +104,7 @@ class PracticeConfig(Settings):
     )
     teacher: Literal["orca", "olfati-saber", "planner", "foresight"] | None = Field(
         None,
-        description="who flies some episodes for the policy to learn from; planner, foresight: see all; null: none (ours)",
+        description="who flies some episodes to learn from; planner, foresight: plan for the whole flock; null: none (ours)",
     )
     teacher_share: float = Field(0.25, ge=0, le=1, description="share of the episodes that the teacher flies (ours)")
     teacher_noise: NotNegative = Field(
@@ -164,11 +164,8 @@ class TrainingConfig(Settings):
 
     @model_validator(mode="after")
     def _guided_by_someone(self) -> TrainingConfig:
-        advises = self.practice.teacher in (
-            "orca",
-            "planner",
-            "foresight",
-        )  # Olfati-Saber's law knows its velocity only where it flies
+        # Olfati-Saber's law knows its velocity only where it flies.
+        advises = self.practice.teacher in ("orca", "planner", "foresight")
         if self.learner.guidance and not (advises and self.algo == "ddpg" and self.learner.n_steps == 1):
             needed = "practice.teacher orca, planner or foresight, algo ddpg and n_steps 1"
             raise ValueError(f"guidance = {self.learner.guidance}: input should be 0 without {needed}")

@@ -1,11 +1,12 @@
-"""How closely a flock could track if one saw everything: ``python tests/benchmarks/full_sight.py`` (needs numba).
+"""How closely a flock could track if one saw everything: ``python tests/benchmarks/full_sight.py`` (extras fast, orca).
 
-Five on the paper's tasks, and among obstacles that cross the flock:
+Five who fly the paper's tasks, and among obstacles that cross the flock:
 
 - `orca` sees what our policies see;
-- `planner`, the teacher, gives each vehicle a place and lets ORCA fly there;
-- `foresight`, the other teacher, plans the next two seconds of all vehicles at once, as unicycles; `shared` plans twice as long
-  and closer packs, and `all` also knows of obstacles that no vehicle detects.
+- `planner`, a teacher, gives each vehicle a place and lets ORCA fly there;
+- `foresight`, a teacher, plans the next twenty steps of all vehicles at once, as unicycles;
+- `shared` is foresight by twice the rounds of descent, with closer packs, that gives no link up which is shorter than 1 m;
+- `all` is the same that also knows of obstacles which no vehicle detects.
 
 And a bound for crossing obstacles: at each settled moment by itself, five places of a hexagonal lattice, free of the obstacles
 and connected, as near to the waypoint as possible.
@@ -31,7 +32,6 @@ SEED = 1
 COLUMNS = ("tracking_error", "neighbor_violation_rate", "obstacle_violation_rate", "connectivity", "mean_separation")
 
 ALL = ForesightGains(separation=1.03, slack=6.0, sight=np.inf, rounds=400)
-"""Foresight that knows of every obstacle and plans better than a training could wait for."""
 SHARED = replace(ALL, sight=1.0)
 
 

@@ -15,7 +15,11 @@ SHIPPED = sorted(shipped_policies())
 
 def test_the_papers_setups_and_more_are_shipped():
     setups = ("3v1o", "5v1o", "5v2o")
-    assert {"general", *(f"{kind}-{setup}" for kind in ("paper", "second-look") for setup in setups)} <= set(SHIPPED)
+    assert {
+        "general",
+        "crossing-5v2o",
+        *(f"{kind}-{setup}" for kind in ("paper", "second-look") for setup in setups),
+    } <= set(SHIPPED)
 
 
 @pytest.mark.parametrize("name", SHIPPED)

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 
-class Wants(NamedTuple):
-    """What plans should keep, and what it weighs beside the mean distance to the waypoint.
+LINK = 0.15
+"""The link range in the unit of all lengths here, so that the weights are the same for tasks of any size: the paper's meter."""
 
-    The weights are for lengths in the paper's meters, where a link is 0.15 long.
-    """
+
+class Wants(NamedTuple):
+    """What plans should keep, and what it weighs beside the mean distance to the waypoint."""
 
     separation: float
     """Distance between vehicles."""
@@ -53,6 +54,8 @@ def descend(
     :param obstacles: where obstacles will be then, ``(steps, obstacles, 2)``
     :param stride: longest way of a step
     :param turn: largest turn of a step [rad]
+    :param wants: what is to be kept besides
+    :param rounds: rounds of descent
     :param pace: how far a control moves in the first round at most, relative to its bound; in the last one a tenth of it
     """
     n, looks, _ = plan.shape
@@ -83,6 +86,7 @@ def descend(
                 slopes[i, t, 1] = to_heading * turn
                 # Who stands does not move by turning; as if it crept: else one that looks away would never turn round.
                 to_heading += (to_y * cos[i, t] - to_x * sin[i, t]) * stride * max(plan[i, t, 0], 0.5)
+        # Adam, its means remembering 0.8 and 0.9 of what they were.
         fade *= 0.8
         fade_square *= 0.9
         step, share = pace * (1.0 - 0.9 * (k + 1) / rounds) / (1.0 - fade), 1.0 / (1.0 - fade_square)
@@ -114,7 +118,7 @@ def slope(down: Array, ways: Array, waypoint: Array, obstacles: Array, wants: Wa
         for j in range(i):
             distance = _distance(ways, i, j)
             _pull(down, ways, i, j, -wants.separation_weight * max(0.0, wants.separation - distance) / distance)
-    nearest, at, joined = np.full(n, np.inf), np.zeros(n, np.int64), np.zeros(n, np.bool_)
+    gaps, at, joined = np.full(n, np.inf), np.zeros(n, np.int64), np.zeros(n, np.bool_)
     last = 0
     for _ in range(n - 1):  # Prim's algorithm
         joined[last] = True
@@ -122,14 +126,14 @@ def slope(down: Array, ways: Array, waypoint: Array, obstacles: Array, wants: Wa
         for j in range(n):
             if not joined[j]:
                 distance = _distance(ways, j, last)
-                if distance < nearest[j]:
-                    nearest[j], at[j] = distance, last
-                if best < 0 or nearest[j] < nearest[best]:
+                if distance < gaps[j]:
+                    gaps[j], at[j] = distance, last
+                if best < 0 or gaps[j] < gaps[best]:
                     best = j
         last = best
-        missing = max(0.0, nearest[last] - wants.reach)
+        missing = max(0.0, gaps[last] - wants.reach)
         pull = wants.reach_weight * missing * max(0.0, 1.0 - missing / wants.slack) ** 2
-        _pull(down, ways, last, at[last], pull / nearest[last])
+        _pull(down, ways, last, at[last], pull / gaps[last])
 
 
 @njit(error_model="numpy", cache=True)

@@ -1,4 +1,4 @@
-"""A teacher that sees everything and plans the next two seconds of all vehicles at once."""
+"""A teacher that plans the next twenty steps of all vehicles at once."""
 
 from __future__ import annotations
 
@@ -43,9 +43,9 @@ class Foresight:
     """Plans the controls of all vehicles together, as the unicycles they are, and advises the first ones.
 
     All are to stay with the waypoint on its way ahead, to keep their distances to each other and to obstacles, and the flock its
-    links. Obstacles that no vehicle detects are not known of; the others are expected to walk straight on at their mean speed.
-    Every plan begins with standing still, so the state alone decides, nothing that was planned before: that is what a policy
-    can imitate.
+    links. Obstacles that no vehicle detects are not known of; the others are expected to walk straight on at their mean speed of
+    the episode. Every plan begins with standing still, so where everything is and goes decides, nothing that was planned
+    before: that is what a policy can imitate.
 
     :param world: the world that it sees, whatever is sensed in it
     :param gains: found by a few trials
@@ -54,17 +54,17 @@ class Foresight:
 
     def __init__(self, world: World, gains: ForesightGains | None = None) -> None:
         try:
-            from sb3_flock.evaluation.controllers.descent import Wants, descend
-        except ImportError:
-            raise SettingsError("teacher = 'foresight': needs numba, pip install 'sb3_flock[fast]'") from None
+            from sb3_flock.evaluation.controllers.descent import LINK, Wants, descend
+        except (ImportError, RuntimeError) as error:  # RuntimeError: as in sb3_flock.sim.backend
+            raise SettingsError(f"teacher = 'foresight': needs numba, pip install 'sb3_flock[fast]' ({error})") from None
         self.world, self.gains, self._descend = world, gains or ForesightGains(), descend
         scenario = world.scenario
-        self._unit = scenario.link_range / 0.15  # of lengths, in which the weights are the same for tasks of all sizes [m]
+        self._unit = scenario.link_range / LINK
         self._wants = Wants(
             self.gains.separation * scenario.neighbor_separation / self._unit,
             self.gains.clearance * scenario.obstacle_separation / self._unit,
-            self.gains.reach * 0.15,
-            self.gains.slack * 0.15,
+            self.gains.reach * LINK,
+            self.gains.slack * LINK,
         )
 
     def reset(self, rngs: Sequence[Generator], scenario: Scenario) -> None:
@@ -83,7 +83,7 @@ class Foresight:
         stride, turn = world.action_high * scenario.time_step / (self._unit, 1.0)
         plans = np.zeros((world.n_flocks, scenario.n_vehicles, gains.steps, 2))
         for flock, plan in enumerate(plans):
-            start, seen = (positions[flock], world.headings[flock]), obstacles[flock][:, known[flock]]
+            start, seen = (positions[flock], world.headings[flock]), np.ascontiguousarray(obstacles[flock][:, known[flock]])
             self._descend(plan, *start, waypoints[flock], seen, stride, turn, self._wants, gains.rounds, gains.pace)
         return plans[:, :, 0] * world.action_high
 

@@ -94,7 +94,7 @@ def test_who_has_lost_the_others_goes_to_the_waypoint_and_not_to_them():
     world.positions = np.array([[[0.0, 0.0], [0.0, 0.4], [0.0, -0.5]]])
     np.testing.assert_allclose(teacher.act(sensing, task)[0, 0], [task.max_speed, 0.0], atol=1e-6)
     world.positions[0, 1] = 0.0, 0.16
-    assert teacher.act(sensing, task)[0, 0, 1] > 0.1  # a link that is about to break
+    assert teacher.act(sensing, task)[0, 0, 1] > 0.1  # out of sight, but not yet given up
 
 
 def test_a_lone_vehicle_turns_round_meets_the_waypoint_and_stays_with_it():
