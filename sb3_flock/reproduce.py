@@ -162,13 +162,11 @@ def _tables(tables: dict[str, dict[str, dict[str, Metric]]]) -> str:
 
 
 def _crossing(rows: dict[str, dict[str, Metric]]) -> str:
-    card = read_card(CROSSING)
     lines_ = [
         "## A hard test: obstacles that cross the flock\n",
         "5 vehicles, 2 obstacles, `--scenario crossing` "
         f"(`{CROSSING}` is trained for it, `paper-5v2o` and `second-look-5v2o` are not):\n",
         *_header(),
-        _row(f"{TRAINED}, median of {len(card['seeds'])} trainings, on record", median_of_seeds(card)),
     ]
     return "\n".join([*lines_, *_rows(rows)])
 
