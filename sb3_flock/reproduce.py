@@ -166,9 +166,8 @@ def _crossing(rows: dict[str, dict[str, Metric]]) -> str:
         "## A hard test: obstacles that cross the flock\n",
         "5 vehicles, 2 obstacles, `--scenario crossing` "
         f"(`{CROSSING}` is trained for it, `paper-5v2o` and `second-look-5v2o` are not):\n",
-        *_header(),
     ]
-    return "\n".join([*lines_, *_rows(rows)])
+    return "\n".join([*lines_, *_header(), *_rows(rows)])
 
 
 def _rows(rows: dict[str, dict[str, Metric]]) -> list[str]:

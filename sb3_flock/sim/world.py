@@ -112,6 +112,15 @@ class World:
         distances = np.sqrt(np.square(self.waypoints).sum(-1, keepdims=True))
         return self.waypoints[:, None] * (1.0 - np.minimum(stride * steps / np.maximum(distances, 1e-12), 1.0))[..., None]
 
+    def obstacles_after(self, steps: NDArray[np.integer]) -> NDArray[np.float64]:
+        """Where obstacles are to be expected: straight ahead, at their mean speed of the episode.
+
+        :param steps: from now on, ``(any,)``
+        :return: ``(flocks, any, obstacles, 2)`` [m]
+        """
+        strides = self.obstacle_speeds.mean(0)[..., None] * _directions(self.obstacle_headings) * self.scenario.time_step
+        return self.obstacle_positions[:, None] + strides[:, None] * steps[:, None, None]
+
     def reset(self, rngs: Sequence[Generator]) -> Sensing:
         """Start an episode in every flock (section V).
 

@@ -67,6 +67,17 @@ def test_an_obstacle_walks_as_a_unicycle_and_turns_back_at_the_edge(scenario, pl
     np.testing.assert_allclose(world.obstacle_headings[0], [np.pi / 2 + 0.1, 0.05 - np.pi], atol=1e-12)
 
 
+def test_crossing_obstacles_go_where_they_are_expected():
+    scenario = Scenario(n_vehicles=2, n_obstacles=3, obstacle_motion="crossing")
+    world, steps = World(scenario, 2), np.array([1, 4, 20])
+    world.reset([episode_rng(0, episode) for episode in range(2)])
+    told = world.obstacles_after(steps)
+    for step in range(1, 21):
+        world.step(np.zeros((2, 2, 2)))
+        if step in steps:
+            np.testing.assert_allclose(world.obstacle_positions, told[:, steps == step][:, 0])
+
+
 def test_crossing_obstacles_start_behind_the_flocks_way_and_walk_straight_through_its_end():
     scenario = Scenario(n_vehicles=5, n_obstacles=4, obstacle_motion="crossing")
     world = World(scenario, 50)

@@ -75,11 +75,10 @@ class Foresight:
         world, gains = self.world, self.gains
         steps = np.arange(1, gains.steps + 1)
         waypoints = world.waypoints_after(np.broadcast_to(steps, (world.n_flocks, gains.steps)))
-        headings = np.stack((np.cos(world.obstacle_headings), np.sin(world.obstacle_headings)), axis=-1)
-        strides = world.obstacle_speeds.mean(0)[..., None] * headings * scenario.time_step
-        obstacles = world.obstacle_positions[:, None] + strides[:, None] * steps[:, None, None]
         known = nearest(world.obstacle_positions, world.positions) < gains.sight * scenario.detection_range
-        positions, waypoints, obstacles = (points / self._unit for points in (world.positions, waypoints, obstacles))
+        positions, waypoints, obstacles = (
+            points / self._unit for points in (world.positions, waypoints, world.obstacles_after(steps))
+        )
         stride, turn = world.action_high * scenario.time_step / (self._unit, 1.0)
         plans = np.zeros((world.n_flocks, scenario.n_vehicles, gains.steps, 2))
         for flock, plan in enumerate(plans):

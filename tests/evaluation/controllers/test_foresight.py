@@ -5,9 +5,9 @@ import pytest
 
 from sb3_flock import Scenario
 from sb3_flock.evaluation.controllers import CONTROLLERS, Foresight
-from sb3_flock.evaluation.episodes import fly_together
 from sb3_flock.settings import SettingsError
 from sb3_flock.sim import World, episode_rng
+from tests.evaluation.controllers.flights import flown
 
 pytest.importorskip("numba")
 
@@ -106,11 +106,6 @@ def test_a_lone_vehicle_turns_round_meets_the_waypoint_and_stays_with_it():
         sensing, _ = world.step(teacher.act(sensing, task))
     assert sensing.waypoint_distances.item() < 0.01
     assert world.waypoints[0, 0] > 1.0
-
-
-def flown(pilot, scenario, episodes):
-    results = fly_together(pilot, scenario, [episode_rng(5, episode) for episode in range(episodes)])
-    return {name: np.nanmean(values) for name, values in results.items()}
 
 
 def test_its_flocks_stand_close_keep_their_distances_and_hold_together():

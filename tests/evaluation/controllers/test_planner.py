@@ -6,9 +6,9 @@ import pytest
 from sb3_flock import Scenario
 from sb3_flock.evaluation.controllers import CONTROLLERS, Orca, Planner
 from sb3_flock.evaluation.controllers.planner import Packs, PlannerGains, _connected, way_lengths
-from sb3_flock.evaluation.episodes import fly_together
 from sb3_flock.settings import SettingsError
 from sb3_flock.sim import World, episode_rng
+from tests.evaluation.controllers.flights import flown
 
 pytest.importorskip("pyrvo")
 pytest.importorskip("scipy")
@@ -118,11 +118,6 @@ def test_vehicles_hold_together_over_others():
     gap = chain + np.where(np.arange(6) > 2, 0.05, 0.0)[:, None]
     np.testing.assert_array_equal(_connected(np.stack((chain, gap)), 0.11), [True, False])
     assert _connected(chain[:1], 0.1)
-
-
-def flown(pilot, scenario, episodes):
-    results = fly_together(pilot, scenario, [episode_rng(5, episode) for episode in range(episodes)])
-    return {name: np.nanmean(values) for name, values in results.items()}
 
 
 def test_its_flocks_stand_nearer_and_hold_together_better_than_those_without_full_sight():
