@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
+from sb3_flock.evaluation.controllers.foresight import ForesightGains
 from sb3_flock.settings import NotNegative, Positive, Settings
 from sb3_flock.sim import Scenario
 from sb3_flock.sim.scenario import MAX_BODIES
@@ -102,14 +103,15 @@ class PracticeConfig(Settings):
     obstacle_separation_ratio: float | None = Field(
         None, ge=1, le=1e6, description="the same for obstacles; null: separation_ratio (ours; paper: 1)"
     )
-    teacher: Literal["orca", "olfati-saber", "planner", "foresight"] | None = Field(
+    teacher: Literal["orca", "olfati-saber", "foresight"] | None = Field(
         None,
-        description="who flies some episodes to learn from; planner, foresight: plan for the whole flock; null: none (ours)",
+        description="who flies some episodes to learn from; foresight: plans for the whole flock; null: none (ours)",
     )
     teacher_share: float = Field(0.25, ge=0, le=1, description="share of the episodes that the teacher flies (ours)")
     teacher_noise: NotNegative = Field(
         0.1, description="standard deviation of the noise on the teacher's actions [half the action range] (ours)"
     )
+    foresight: ForesightGains = Field(default_factory=ForesightGains, description="what the teacher foresight keeps (ours)")
 
 
 class TrainingConfig(Settings):
@@ -165,9 +167,9 @@ class TrainingConfig(Settings):
     @model_validator(mode="after")
     def _guided_by_someone(self) -> TrainingConfig:
         # Olfati-Saber's law knows its velocity only where it flies.
-        advises = self.practice.teacher in ("orca", "planner", "foresight")
+        advises = self.practice.teacher in ("orca", "foresight")
         if self.learner.guidance and not (advises and self.algo == "ddpg" and self.learner.n_steps == 1):
-            needed = "practice.teacher orca, planner or foresight, algo ddpg and n_steps 1"
+            needed = "practice.teacher orca or foresight, algo ddpg and n_steps 1"
             raise ValueError(f"guidance = {self.learner.guidance}: input should be 0 without {needed}")
         return self
 

@@ -6,6 +6,7 @@ import contextlib
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from sb3_flock.envs.demonstrations import DemonstratedEnv
 from sb3_flock.envs.flocking_v0 import parallel_env
 from sb3_flock.envs.side_by_side import SideBySide
 from sb3_flock.envs.vec_env import ParameterSharingVecEnv, flatten
-from sb3_flock.evaluation.controllers import TEACHERS
+from sb3_flock.evaluation.controllers import TEACHERS, Foresight
 from sb3_flock.rl.algorithms import build_model
 from sb3_flock.rl.callbacks import DemonstratedActions, FadingNoise, FlockMetrics, NeighborInclusiveReward
 from sb3_flock.rl.checkpoints import LoadedCheckpoint, Stateful, inexactness, newest_checkpoint
@@ -177,6 +178,8 @@ def _flock(config: TrainingConfig, flown: Scenario) -> parallel_env:
     if practice.teacher is None:
         return parallel_env(flown)
     teacher = TEACHERS[practice.teacher]
+    if teacher is Foresight:
+        teacher = partial(Foresight, gains=practice.foresight)
     return DemonstratedEnv(
         flown, teacher, practice.teacher_share, practice.teacher_noise, advises=config.learner.guidance > 0
     )

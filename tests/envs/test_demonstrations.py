@@ -61,7 +61,7 @@ def test_it_flies_its_share_of_the_episodes_with_its_noise():
     assert actions.std(axis=0).min() > 0.01
 
 
-@pytest.mark.parametrize("adviser", ["planner", "foresight"])
+@pytest.mark.parametrize("adviser", ["orca", "foresight"])
 def test_an_adviser_says_in_every_step_what_it_would_do_there(adviser):
     env = DemonstratedEnv(CROWD, TEACHERS[adviser], share=0.5, noise=0.1, advises=True)
     rng = np.random.default_rng(0)
@@ -104,7 +104,7 @@ def test_flattened_flocks_tell_what_was_flown(num_cpus):
 
 @pytest.mark.parametrize("num_cpus", [0, 2])
 def test_each_copy_is_advised_of_its_own_world(num_cpus):
-    pair = SideBySide([DemonstratedEnv(CROWD, TEACHERS["planner"], 0.0, 0.0, advises=True) for _ in range(2)])
+    pair = SideBySide([DemonstratedEnv(CROWD, TEACHERS["foresight"], 0.0, 0.0, advises=True) for _ in range(2)])
     env = flatten(pair, n_copies=2, num_cpus=num_cpus, seed=0)
     try:
         env.reset()
@@ -137,7 +137,7 @@ class Record(BaseCallback):
 
 def test_the_replay_buffer_takes_what_was_flown(tmp_path):
     record = Record()
-    changes = {"teacher": "planner", "teacher_share": 0.5, "guidance": 1.0, "n_flocks": 6, "learning_starts": 100}
+    changes = {"teacher": "orca", "teacher_share": 0.5, "guidance": 1.0, "n_flocks": 6, "learning_starts": 100}
     model = train(tiny(tmp_path, total_timesteps=540, **changes), quiet(), callbacks=[record]).model
     taught = np.array(record.taught)
     assert 0.2 < taught.mean() < 0.8
@@ -155,7 +155,7 @@ def test_mistakes_are_one_line(tmp_path):
     for name, value in (("teacher", "random"), ("teacher_share", 1.1), ("teacher_noise", -0.1)):
         with pytest.raises(SettingsError, match=f"{name} = "):
             tiny(tmp_path, **{f"practice.{name}": value})
-    needed = "guidance = 0.5: input should be 0 without practice.teacher orca, planner or foresight, algo ddpg and n_steps 1"
+    needed = "guidance = 0.5: input should be 0 without practice.teacher orca or foresight, algo ddpg and n_steps 1"
     for changes in ({}, {"teacher": "olfati-saber"}, {"teacher": "orca", "algo": "td3"}, {"teacher": "orca", "n_steps": 3}):
         with pytest.raises(SettingsError, match=needed):
             tiny(tmp_path, guidance=0.5, **changes)

@@ -69,7 +69,7 @@ LONG = {"scenario.max_cycles": 40, "save_freq": 120, "eval_freq": 180, "total_ti
         ("sac", {}),
         ("ddpg", {"buffer_size": 10_000}),
         ("ddpg", {"look_back": 0.4, "teacher": "orca", "teacher_share": 0.5}),
-        ("ddpg", {"teacher": "planner", "guidance": 1.0, "teacher_share": 0.3}),
+        ("ddpg", {"teacher": "orca", "guidance": 1.0, "teacher_share": 0.3}),
         ("ddpg", {"teacher": "foresight", "guidance": 1.0, "teacher_share": 0.3}),
         ("ddpg", {"teacher": "olfati-saber", "teacher_share": 0.9, "practice.vehicles": [1, 2]}),
     ],

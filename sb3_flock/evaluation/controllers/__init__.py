@@ -8,7 +8,6 @@ from sb3_flock.envs.demonstrations import Teacher
 from sb3_flock.evaluation.controllers.foresight import Foresight
 from sb3_flock.evaluation.controllers.olfati_saber import OlfatiSaber
 from sb3_flock.evaluation.controllers.orca import Orca
-from sb3_flock.evaluation.controllers.planner import Planner
 from sb3_flock.evaluation.controllers.simple import GoToWaypoint, RandomController
 from sb3_flock.evaluation.episodes import Controller
 from sb3_flock.settings import SettingsError
@@ -25,7 +24,6 @@ CONTROLLERS: dict[str, type[Controller]] = {
 TEACHERS: dict[str, Callable[[World], Teacher]] = {
     "olfati-saber": lambda world: OlfatiSaber(),
     "orca": lambda world: Orca(),
-    "planner": Planner,
     "foresight": Foresight,
 }
 """Who can fly and advise for a policy to learn from, by name. A teacher may see the whole world, a controller may not."""
@@ -37,7 +35,6 @@ __all__ = [
     "GoToWaypoint",
     "OlfatiSaber",
     "Orca",
-    "Planner",
     "RandomController",
     "make_controller",
 ]

@@ -27,9 +27,9 @@ class Wants(NamedTuple):
     """Length of the links that join the flock."""
     slack: float
     """Length beyond that at which a link no longer counts."""
-    separation_weight: float = 500.0
-    clearance_weight: float = 1000.0
-    reach_weight: float = 60.0
+    separation_weight: float
+    clearance_weight: float
+    reach_weight: float
 
 
 @njit(error_model="numpy", cache=True)

@@ -3,40 +3,39 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
+from pydantic import Field
 
-from sb3_flock.settings import SettingsError
+from sb3_flock.settings import NotNegative, Positive, Settings, SettingsError
 from sb3_flock.sim import Scenario, Sensing, World
 from sb3_flock.sim.sensing import nearest
 
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class ForesightGains:
-    """What is free in foresight."""
+class ForesightGains(Settings):
+    """What its plans keep, what that weighs beside the mean distance to the waypoint, and how it plans.
 
-    separation: float = 1.06
-    """Distance between vehicles that plans keep, relative to the minimum separation to neighbors."""
-    clearance: float = 1.033
-    """Distance to obstacles that plans keep, relative to the minimum separation to them."""
-    reach: float = 0.93
-    """Length of links that plans keep, relative to the link range."""
-    slack: float = 2 / 3
-    """Longer than that by this much [link ranges] a link is given up: who has lost the others finds them at the waypoint."""
-    sight: float = 1.0
-    """Distance from a vehicle at which an obstacle is known of, relative to the detection range."""
-    steps: int = 20
-    """Steps planned ahead."""
-    rounds: int = 200
-    """Rounds of descent."""
-    pace: float = 0.06
-    """How far a control moves in the first round at most, relative to its bound."""
+    A weight is that of half the square of what is missing, in lengths where the link range is 0.15 m: the same for any task.
+    """
+
+    separation: Positive = Field(
+        1.06, description="distance between vehicles [minimum separations to neighbors in practice]"
+    )
+    clearance: Positive = Field(1.033, description="distance to obstacles [minimum separations to them in practice]")
+    reach: Positive = Field(0.93, description="length of links [link ranges]")
+    slack: Positive = Field(2 / 3, description="longer than that by this much a link is given up [link ranges]")
+    separation_weight: NotNegative = Field(500.0, description="weight of the distance between vehicles [1/m]")
+    clearance_weight: NotNegative = Field(1000.0, description="weight of the distance to obstacles [1/m]")
+    reach_weight: NotNegative = Field(60.0, description="weight of the length of links [1/m]")
+    sight: NotNegative = Field(1.0, description="distance to a vehicle at which an obstacle is known of [detection ranges]")
+    steps: int = Field(20, ge=1, le=1000, description="steps planned ahead")
+    rounds: int = Field(200, ge=1, le=1_000_000, description="rounds of descent")
+    pace: Positive = Field(0.06, description="how far a control moves in the first round at most [of its bound]")
 
 
 class Foresight:
@@ -65,6 +64,9 @@ class Foresight:
             self.gains.clearance * scenario.obstacle_separation / self._unit,
             self.gains.reach * LINK,
             self.gains.slack * LINK,
+            self.gains.separation_weight,
+            self.gains.clearance_weight,
+            self.gains.reach_weight,
         )
 
     def reset(self, rngs: Sequence[Generator], scenario: Scenario) -> None:

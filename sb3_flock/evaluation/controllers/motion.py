@@ -29,8 +29,8 @@ def steer(velocities: NDArray[np.float64], scenario: Scenario) -> NDArray[np.flo
     )
 
 
-def limit(vectors: NDArray[np.float64], length: float | NDArray[np.float64]) -> NDArray[np.float64]:
-    """The vectors ``(..., 2)``, shortened to a length where they exceed it; one for all, or any that broadcast to ``(...)``."""
+def limit(vectors: NDArray[np.float64], length: float) -> NDArray[np.float64]:
+    """The vectors ``(..., 2)``, shortened to a length where they exceed it."""
     return vectors * np.minimum(1.0, length / np.maximum(np.hypot(vectors[..., 0], vectors[..., 1]), 1e-12))[..., None]
 
 

@@ -52,10 +52,6 @@ class Orca:
 
     def act(self, sensing: Sensing, scenario: Scenario) -> NDArray[np.float64]:
         """The actions that fly ORCA's velocities."""
-        return steer(self.velocities(sensing, scenario), scenario)
-
-    def velocities(self, sensing: Sensing, scenario: Scenario) -> NDArray[np.float64]:
-        """ORCA's velocities ``(flocks, vehicles, 2)`` [m/s], in the body frames; to be asked for once a step."""
         gains, dt, speed = self.gains, scenario.time_step, scenario.max_speed
         own_radius = scenario.neighbor_separation / 2 + gains.margin / 2
         obstacle_radius = max(0.0, scenario.obstacle_separation + gains.margin - own_radius)
@@ -78,7 +74,8 @@ class Orca:
             for observer, position, velocity in rows:
                 islands.add(observer, position, velocity, velocity, radius, 0.0, gains.time_horizon, speed)
         simulator.do_step()
-        return np.array([islands.velocity(i) for i in range(len(wanted))]).reshape(sensing.waypoint_positions.shape)
+        chosen = np.array([islands.velocity(i) for i in range(len(wanted))]).reshape(sensing.waypoint_positions.shape)
+        return steer(chosen, scenario)
 
     def state_dict(self) -> dict[str, Any]:
         """What is remembered of the episodes under way: plain values and arrays."""

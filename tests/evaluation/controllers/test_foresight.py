@@ -35,7 +35,7 @@ def cost(ways, waypoint, obstacles, wants):
 
 @pytest.mark.parametrize("seed", range(20))
 def test_the_slope_is_that_of_the_cost(seed):
-    rng, wants = np.random.default_rng(seed), Wants(0.11, 0.16, 0.12, 0.1)
+    rng, wants = np.random.default_rng(seed), Wants(0.11, 0.16, 0.12, 0.1, 500.0, 1000.0, 60.0)
     ways, obstacles, waypoint = (rng.uniform(-size, size, (count, 2)) for size, count in ((0.12, 5), (0.3, 2), (0.05, 1)))
     down, numeric = np.empty((5, 2)), np.empty((5, 2))
     slope(down, ways, waypoint[0], obstacles, wants)
