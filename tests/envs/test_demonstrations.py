@@ -151,9 +151,16 @@ def test_the_replay_buffer_takes_what_was_flown(tmp_path):
         FlockDDPG.load(tmp_path / "guided.zip", env=make_vec_env(Scenario(), n_flocks=6), device="cpu").learn(400)
 
 
+def test_foresight_keeps_what_the_config_says(tmp_path):
+    config = tiny(tmp_path, teacher="foresight", **{"practice.foresight.rounds": 3})
+    teachers = train(config, quiet()).model.get_env().get_attr("teacher")
+    assert config.practice.foresight.rounds == 3
+    assert {teacher.gains for teacher in teachers} == {config.practice.foresight}
+
+
 def test_mistakes_are_one_line(tmp_path):
-    for name, value in (("teacher", "random"), ("teacher_share", 1.1), ("teacher_noise", -0.1)):
-        with pytest.raises(SettingsError, match=f"{name} = "):
+    for name, value in (("teacher", "random"), ("teacher_share", 1.1), ("teacher_noise", -0.1), ("foresight.rounds", 0)):
+        with pytest.raises(SettingsError, match=f"{name.split('.')[-1]} = "):
             tiny(tmp_path, **{f"practice.{name}": value})
     needed = "guidance = 0.5: input should be 0 without practice.teacher orca or foresight, algo ddpg and n_steps 1"
     for changes in ({}, {"teacher": "olfati-saber"}, {"teacher": "orca", "algo": "td3"}, {"teacher": "orca", "n_steps": 3}):

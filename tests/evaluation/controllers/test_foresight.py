@@ -5,6 +5,7 @@ import pytest
 
 from sb3_flock import Scenario
 from sb3_flock.evaluation.controllers import CONTROLLERS, Foresight
+from sb3_flock.evaluation.controllers.foresight import ForesightGains
 from sb3_flock.settings import SettingsError
 from sb3_flock.sim import World, episode_rng
 from tests.evaluation.controllers.flights import flown
@@ -95,6 +96,8 @@ def test_who_has_lost_the_others_goes_to_the_waypoint_and_not_to_them():
     np.testing.assert_allclose(teacher.act(sensing, task)[0, 0], [task.max_speed, 0.0], atol=1e-6)
     world.positions[0, 1] = 0.0, 0.16
     assert teacher.act(sensing, task)[0, 0, 1] > 0.1  # out of sight, but not yet given up
+    careless = Foresight(world, ForesightGains(reach_weight=0.0))
+    np.testing.assert_allclose(careless.act(sensing, task)[0, 0], [task.max_speed, 0.0], atol=1e-6)
 
 
 def test_a_lone_vehicle_turns_round_meets_the_waypoint_and_stays_with_it():
