@@ -77,7 +77,7 @@ def ship(name: str, runs: Sequence[str | Path], folder: str | Path, episodes: in
 
 
 def _copy_light(source: Path, target: Path) -> None:
-    """Copy a policy at half its size: the target networks become the networks they follow, whose numbers are stored once.
+    """Copy a policy at a quarter of its size: numbers of half precision, once for each target network and the one it follows.
 
     Of its config the folder is left out: it was another machine's.
     """
@@ -87,7 +87,8 @@ def _copy_light(source: Path, target: Path) -> None:
             if name == "policy.pth":
                 weights = th.load(io.BytesIO(content), weights_only=True)
                 stored = io.BytesIO()
-                th.save({key: weights[key.replace("_target.", ".")] for key in weights}, stored)
+                halves = {key: weight.half() for key, weight in weights.items()}
+                th.save({key: halves[key.replace("_target.", ".")] for key in halves}, stored)
                 content = stored.getvalue()
             elif name == MEMBER:
                 member = json.loads(content)

@@ -221,8 +221,8 @@ def _rebuild(config: TrainingConfig, weights: Mapping[str, Any], actor_only: boo
     for tensor in weights.values():
         if not isinstance(tensor, th.Tensor) or tensor.layout != th.strided or tensor.is_meta:
             raise ValueError("policy.pth holds something else than numbers")
-    storages = [tensor.untyped_storage() for tensor in weights.values()]
-    stored = sum({storage.data_ptr(): storage.nbytes() // 4 for storage in storages}.values())
+    storages = [(tensor.untyped_storage(), tensor.element_size()) for tensor in weights.values()]
+    stored = sum({storage.data_ptr(): storage.nbytes() // size for storage, size in storages}.values())
     least = _least_parameters(config)
     if least > stored:
         raise ValueError(f"policy.pth holds {stored} numbers, the networks at least {least}")

@@ -45,13 +45,14 @@ def test_a_card_keeps_every_training_and_the_zip_is_the_best_ones(tmp_path, monk
     assert [seed["seed"] for seed in card["seeds"]] == [0, 1, 2]
     assert card["shipped_seed"] == best
     shipped, original = load_policy(path), load_policy(runs[best])
-    assert path.stat().st_size < 0.6 * original.path.stat().st_size
+    assert path.stat().st_size < 0.4 * original.path.stat().st_size
     assert shipped.config == original.config.replace(output_dir="runs")
     weights = original.policy.state_dict()
     for key, tensor in shipped.policy.state_dict().items():
-        assert th.equal(tensor, weights[key.replace("_target.", ".")])
+        assert tensor.dtype == th.float32
+        assert th.equal(tensor, weights[key.replace("_target.", ".")].half().float())
     model = FlockDDPG.load(path, device="cpu")  # SB3 reads it as before
-    assert th.equal(model.policy.state_dict()["actor.mu.0.weight"], weights["actor.mu.0.weight"])
+    assert th.equal(model.policy.state_dict()["actor.mu.0.weight"], shipped.policy.state_dict()["actor.mu.0.weight"])
     errors = [evaluate(load_policy(run), episodes=3, seed=0)["tracking_error"].mean for run in runs]
     assert median_of_seeds(card)["tracking_error"] == pytest.approx(np.median(errors), abs=1e-4)
     assert len(card["seeds"][0]["curve"]["timesteps"]) == len(card["seeds"][0]["curve"]["return"]) == 5
