@@ -59,9 +59,12 @@ def print_flight(name: str, scenario: Scenario, pilot: Callable[[World], Control
 
 def crossing_teacher() -> ForesightGains:
     """What the teacher of ``configs/crossing_5v2o.yaml`` keeps, in separations of the task."""
-    practice = load_config(TrainingConfig, Path(__file__).parents[2] / "configs" / "crossing_5v2o.yaml").practice
-    gains, apart, away = practice.foresight, practice.separation_ratio, practice.obstacle_separation_ratio or 1.0
-    return gains.replace(separation=gains.separation * apart, clearance=gains.clearance * away)
+    config = load_config(TrainingConfig, Path(__file__).parents[2] / "configs" / "crossing_5v2o.yaml")
+    task, (flown,), gains = config.scenario, config.flown_scenarios(), config.practice.foresight
+    return gains.replace(
+        separation=gains.separation * flown.neighbor_separation / task.neighbor_separation,
+        clearance=gains.clearance * flown.obstacle_separation / task.obstacle_separation,
+    )
 
 
 def main(episodes: int = 100) -> None:
