@@ -3,10 +3,10 @@
 import sys
 
 from sb3_flock import evaluate, load_policy
-from sb3_flock.evaluation.controllers import make_controller
-from sb3_flock.evaluation.figures import flights, record, save_as
+from sb3_flock.controllers import make_controller
+from sb3_flock.viz.figures import flights, record, save_as
 
-policy = load_policy(sys.argv[1] if len(sys.argv) > 1 else "paper-5v2o")
+policy = load_policy(sys.argv[1] if len(sys.argv) > 1 else "ddpg-5v2o")
 episodes = int(sys.argv[2]) if len(sys.argv) > 2 else 200
 flyers = {"ours": policy, "Olfati-Saber": make_controller("olfati-saber")}
 for name, flyer in flyers.items():

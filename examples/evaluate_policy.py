@@ -5,7 +5,7 @@ import sys
 import numpy as np
 
 from sb3_flock import evaluate, load_policy
-from sb3_flock.evaluation.figures import lines, save_as
+from sb3_flock.viz.figures import lines, save_as
 
 policy = load_policy(sys.argv[1])  # a zip or a run folder
 fleets, curve = (2, 3, 5, 8), []

@@ -1,4 +1,4 @@
-"""One vehicle's own computer: numpy and onnxruntime alone, with a policy from ``sb3-flock export paper-5v2o policy.onnx``.
+"""One vehicle's own computer: numpy and onnxruntime alone, with a policy from ``sb3-flock export ddpg-5v2o policy.onnx``.
 
 The radio and the sensors are yours; here they are played by a small world of points.
 """
@@ -31,7 +31,7 @@ def measured(points):
 
 
 looks = []  # what was measured, where and facing where: only the policies with a second look need it
-steps_back = round(task["look_back"] / task["time_step"])
+steps_back = round(task["motion_lag"] / task["time_step"])
 
 for step in range(100):
     now = {"neighbors": measured(neighbors), "obstacles": measured(obstacles), "waypoint": measured(waypoint)[0]}
@@ -39,7 +39,7 @@ for step in range(100):
     inputs = now
     if steps_back:
         before, place, facing = looks[0]
-        moved = np.append(seen_from(place, facing, position)[0], heading - facing)  # by odometry
+        ego_motion = np.append(seen_from(place, facing, position)[0], heading - facing)  # by odometry
         inputs = {**now, **{f"{name}_before": points for name, points in before.items()}, "moved": moved}
     (speed, turn_rate), *_ = policy.run(None, inputs)  # m/s, rad/s, to hold for one sampling period
     position = position + speed * task["time_step"] * np.array([np.cos(heading), np.sin(heading)])

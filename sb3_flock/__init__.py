@@ -1,7 +1,7 @@
-"""sb3_flock: vehicles that flock by reinforcement learning, as a Stable-Baselines3 plugin.
+"""sb3_flock: multi-vehicle flocking by reinforcement learning, as a Stable-Baselines3 plugin.
 
-The public names below load when they are first used, so that importing the package is quick. Importing it registers the
-environment with PettingZoo as ``flock/flocking-v0``.
+The public names below are imported when they are first used, so that importing the package is quick. Importing it registers
+the environment with PettingZoo as ``flock/flocking-v0``.
 """
 
 from __future__ import annotations
@@ -12,27 +12,36 @@ from typing import TYPE_CHECKING, Any
 
 import pettingzoo
 
+from sb3_flock import _renamed
+
 if TYPE_CHECKING:
+    from sb3_flock.config.training import TrainingConfig
+    from sb3_flock.controllers import Controller, make_controller, register_controller
+    from sb3_flock.deploy.onnx_export import export
     from sb3_flock.envs import flocking_v0
+    from sb3_flock.envs.expert_env import ExpertEnv
     from sb3_flock.envs.vec_env import flatten, make_vec_env
-    from sb3_flock.evaluation import evaluate
-    from sb3_flock.evaluation.film import render
+    from sb3_flock.evaluation import evaluate, register_metric
+    from sb3_flock.rl.buffers import CompactReplayBuffer
     from sb3_flock.rl.callbacks import NeighborInclusiveReward
-    from sb3_flock.rl.config import TrainingConfig
     from sb3_flock.rl.ddpg import FlockDDPG
-    from sb3_flock.rl.extractor import FlockCNN
-    from sb3_flock.rl.loading import load_policy
-    from sb3_flock.rl.onboard import export
-    from sb3_flock.rl.policy import FlockPolicy, FlockSACPolicy
-    from sb3_flock.rl.replay import CompactReplayBuffer
-    from sb3_flock.rl.saving import save_model
-    from sb3_flock.rl.training import resume, train
-    from sb3_flock.sim import RewardWeights, Scenario, World
+    from sb3_flock.rl.policies import FlockPolicy, FlockSACPolicy
+    from sb3_flock.rl.registry import register_algorithm
+    from sb3_flock.rl.torch_layers import FlockCNN
+    from sb3_flock.serialization.load import load_policy
+    from sb3_flock.serialization.save import save_model
+    from sb3_flock.sim import RewardWeights, Scenario, World, register_channel, register_reward_term
+    from sb3_flock.training.eval_callback import FlockEvalCallback
+    from sb3_flock.training.train import resume, train
+    from sb3_flock.viz.video import render
 
 __all__ = [
     "CompactReplayBuffer",
+    "Controller",
+    "ExpertEnv",
     "FlockCNN",
     "FlockDDPG",
+    "FlockEvalCallback",
     "FlockPolicy",
     "FlockSACPolicy",
     "NeighborInclusiveReward",
@@ -45,7 +54,13 @@ __all__ = [
     "flatten",
     "flocking_v0",
     "load_policy",
+    "make_controller",
     "make_vec_env",
+    "register_algorithm",
+    "register_channel",
+    "register_controller",
+    "register_metric",
+    "register_reward_term",
     "render",
     "resume",
     "save_model",
@@ -53,25 +68,34 @@ __all__ = [
 ]
 
 _HOMES = {
-    "CompactReplayBuffer": "rl.replay",
-    "FlockCNN": "rl.extractor",
+    "CompactReplayBuffer": "rl.buffers",
+    "Controller": "controllers",
+    "ExpertEnv": "envs.expert_env",
+    "FlockCNN": "rl.torch_layers",
     "FlockDDPG": "rl.ddpg",
-    "FlockPolicy": "rl.policy",
-    "FlockSACPolicy": "rl.policy",
+    "FlockEvalCallback": "training.eval_callback",
+    "FlockPolicy": "rl.policies",
+    "FlockSACPolicy": "rl.policies",
     "NeighborInclusiveReward": "rl.callbacks",
     "RewardWeights": "sim",
     "Scenario": "sim",
-    "TrainingConfig": "rl.config",
+    "TrainingConfig": "config.training",
     "World": "sim",
     "evaluate": "evaluation",
-    "export": "rl.onboard",
+    "export": "deploy.onnx_export",
     "flatten": "envs.vec_env",
-    "load_policy": "rl.loading",
+    "load_policy": "serialization.load",
+    "make_controller": "controllers",
     "make_vec_env": "envs.vec_env",
-    "render": "evaluation.film",
-    "save_model": "rl.saving",
-    "resume": "rl.training",
-    "train": "rl.training",
+    "register_algorithm": "rl.registry",
+    "register_channel": "sim",
+    "register_controller": "controllers",
+    "register_metric": "evaluation",
+    "register_reward_term": "sim",
+    "render": "viz.video",
+    "resume": "training.train",
+    "save_model": "serialization.save",
+    "train": "training.train",
 }
 
 
@@ -89,6 +113,7 @@ def __dir__() -> list[str]:
     return sorted([*globals(), *__all__])
 
 
+_renamed.install()
 if "flock/flocking-v0" not in pettingzoo.parallel_registry:
     pettingzoo.register("parallel", "flock/flocking-v0", entry_point="sb3_flock.envs.flocking_v0:parallel_env")
     pettingzoo.register("aec", "flock/flocking-v0", entry_point="sb3_flock.envs.flocking_v0:env")

@@ -11,31 +11,32 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
+from sb3_flock.config.training import TrainingConfig
+from sb3_flock.controllers import CONTROLLERS, make_controller
 from sb3_flock.envs.vec_env import make_vec_env
 from sb3_flock.evaluation import robustness
-from sb3_flock.evaluation.controllers import CONTROLLERS, make_controller
-from sb3_flock.evaluation.episodes import evaluate
-from sb3_flock.evaluation.figures import check_matplotlib, lines, observation, record, save, trajectories
-from sb3_flock.evaluation.metrics import Metric
+from sb3_flock.evaluation.metrics import Metric, columns
 from sb3_flock.evaluation.model_cards import median_of_seeds, read_card
-from sb3_flock.evaluation.report import PAPER, SHORT_COLUMNS
+from sb3_flock.evaluation.report import PAPER
 from sb3_flock.evaluation.robustness import evaluate_with_errors
-from sb3_flock.rl.algorithms import build_model
+from sb3_flock.evaluation.rollout import evaluate
+from sb3_flock.pretrained import shipped_policies
 from sb3_flock.rl.callbacks import NeighborInclusiveReward
-from sb3_flock.rl.config import TrainingConfig
-from sb3_flock.rl.loading import LoadedPolicy, load_policy, shipped_policies
-from sb3_flock.rl.saving import versions
+from sb3_flock.rl.registry import build_model
+from sb3_flock.serialization.load import LoadedPolicy, load_policy
+from sb3_flock.serialization.save import versions
 from sb3_flock.settings import SettingsError
 from sb3_flock.sim import Scenario
+from sb3_flock.viz.figures import check_matplotlib, plot_lines, plot_observation, plot_trajectories, record_trajectory, save
 
 SETTINGS = {
-    "paper-3v1o": Scenario(n_vehicles=3, n_obstacles=1),
-    "paper-5v1o": Scenario(n_vehicles=5, n_obstacles=1),
-    "paper-5v2o": Scenario(n_vehicles=5, n_obstacles=2),
+    "ddpg-3v1o": Scenario(n_vehicles=3, n_obstacles=1),
+    "ddpg-5v1o": Scenario(n_vehicles=5, n_obstacles=1),
+    "ddpg-5v2o": Scenario(n_vehicles=5, n_obstacles=2),
 }
 """The paper's experiments by the shipped policy's name."""
 
-OURS = {"ours": "paper-", "ours, with a second look": "second-look-"}
+OURS = {"ours": "ddpg-", "ours, with a second look": "ddpg-bc-"}
 """Our rows, and how the names of their policies begin."""
 
 CROSSING = "crossing-5v2o"
@@ -100,14 +101,14 @@ def reproduce(out: str | Path, quick: bool = False, console: Console | None = No
         parts.append(_tables(tables))
         status.update("a hard test: crossing obstacles")
         trained = policies[CROSSING]
-        parts.append(_crossing(_fly_all({TRAINED: trained, **ours["paper-5v2o"]}, trained.scenario, size.episodes)))
+        parts.append(_crossing(_fly_all({TRAINED: trained, **ours["ddpg-5v2o"]}, trained.scenario, size.episodes)))
         status.update("figures")
-        parts.append(_flight_figures(folder, policies["paper-5v2o"]))
+        parts.append(_flight_figures(folder, policies["ddpg-5v2o"]))
         parts.append(_training_curve(folder))
         status.update("one policy with 1 to 200 vehicles")
         parts.append(_fleets(folder, policies["general"], size.fleet_episodes))
         status.update("sensors that err")
-        parts.append(_sensors(policies["paper-5v2o"], size.episodes // 4 or 1))
+        parts.append(_sensors(policies["ddpg-5v2o"], size.episodes // 4 or 1))
         status.update("time of training against the number of vehicles")
         parts.append(_training_time(folder, size.timed_steps))
     (folder / "results.md").write_text("\n\n".join(parts) + "\n", encoding="utf-8")
@@ -126,13 +127,13 @@ def _head(size: Size) -> str:
 
 def _ours(name: str) -> dict[str, str]:
     """The names of our policies for an experiment of :data:`SETTINGS`, by label."""
-    return {label: name.replace("paper-", kind) for label, kind in OURS.items()}
+    return {label: name.replace("ddpg-", kind) for label, kind in OURS.items()}
 
 
 def _fly_all(ours: dict[str, LoadedPolicy], scenario: Scenario, episodes: int) -> dict[str, dict[str, Metric]]:
     """The metrics of the policies, by label, and of every hand-written controller that is installed."""
     rows = {
-        label: evaluate(policy, scenario.replace(look_back=policy.scenario.look_back), episodes, seed=0)
+        label: evaluate(policy, scenario.replace(motion_lag=policy.scenario.motion_lag), episodes, seed=0)
         for label, policy in ours.items()
     }
     for name in CONTROLLERS:
@@ -165,7 +166,7 @@ def _crossing(rows: dict[str, dict[str, Metric]]) -> str:
     lines_ = [
         "## A hard test: obstacles that cross the flock\n",
         "5 vehicles, 2 obstacles, `--scenario crossing` "
-        f"(`{CROSSING}` is trained for it, `paper-5v2o` and `second-look-5v2o` are not):\n",
+        f"(`{CROSSING}` is trained for it, `ddpg-5v2o` and `ddpg-bc-5v2o` are not):\n",
     ]
     return "\n".join([*lines_, *_header(), *_rows(rows)])
 
@@ -192,8 +193,8 @@ def _row(label: str, values: dict[str, Any]) -> str:
 
 
 def _flight_figures(folder: Path, policy: LoadedPolicy) -> str:
-    save(trajectories(record(policy, policy.scenario, seed=0, episode=1)), folder / "trajectories")
-    save(observation(policy.scenario), folder / "observation")
+    save(plot_trajectories(record_trajectory(policy, policy.scenario, seed=0, episode=1)), folder / "trajectories")
+    save(plot_observation(policy.scenario), folder / "observation")
     return (
         "## One flight, and what a vehicle sees\n\n![paths of one episode](trajectories.png)\n\n"
         "![ten neighbors and the channel that shows them](observation.png)"
@@ -205,11 +206,11 @@ def _training_curve(folder: Path) -> str:
     series = {}
     for name, scenario in SETTINGS.items():
         seeds = read_card(name)["seeds"]
-        steps = load_policy(name).config.flown_scenarios()[0]
+        steps = load_policy(name).config.training_scenarios()[0]
         episodes = np.array(seeds[0]["curve"]["timesteps"]) / (steps.n_vehicles * steps.max_cycles)
         returns = np.array([seed["curve"]["return"] for seed in seeds])
         series[scenario.bodies] = (episodes, returns)
-    save(lines(series, "episodes of a flock practiced", "return of a vehicle, 100 episodes"), folder / "training")
+    save(plot_lines(series, "episodes of a flock practiced", "return of a vehicle, 100 episodes"), folder / "training")
     return (
         "## Training curves\n\n![return against episodes](training.png)\n\nThe line is the median over the trainings, the shade "
         "all of them. The paper's policy was stable after about 10 000 episodes."
@@ -242,7 +243,7 @@ def _fleets(folder: Path, policy: LoadedPolicy, episodes: int) -> str:
         ),
         "share not connected": (FLEETS, np.array([1 - (row["connectivity"].mean or 0.0) for row in rows])),
     }
-    save(lines(series, "vehicles", "meters or share", log_x=True), folder / "fleets")
+    save(plot_lines(series, "vehicles", "meters or share", log_x=True), folder / "fleets")
     return "\n".join([*lines_, "\n![metrics against vehicles](fleets.png)"])
 
 
@@ -250,9 +251,9 @@ def _sensors(policy: LoadedPolicy, episodes: int) -> str:
     rows = evaluate_with_errors(policy, policy.scenario, episodes)
     lines_ = [
         "## Sensors that err\n",
-        f"`paper-5v2o`, trained with exact ones; {episodes} episodes a row (`sb3-flock evaluate paper-5v2o --sensors`):\n",
-        "| sensor errors | " + " | ".join(heading for heading, _ in SHORT_COLUMNS.values()) + " |",
-        "|---" * (len(SHORT_COLUMNS) + 1) + "|",
+        f"`ddpg-5v2o`, trained with exact ones; {episodes} episodes a row (`sb3-flock evaluate ddpg-5v2o --sensors`):\n",
+        "| sensor errors | " + " | ".join(metric.column for metric in columns().values()) + " |",
+        "|---" * (len(columns()) + 1) + "|",
     ]
     return "\n".join([*lines_, *(f"| {name} | " + " | ".join(robustness.cells(row)) + " |" for name, row in rows.items())])
 
@@ -277,7 +278,7 @@ def _training_time(folder: Path, steps: int) -> str:
         "two updates for five transitions (our default)": [_seconds_per_flock_step(n, 0.4, steps) for n in fleets],
     }
     series = {label: (fleets, 1000 * np.array(values)) for label, values in measured.items()}
-    save(lines(series, "vehicles", "milliseconds a flock step"), folder / "training_time")
+    save(plot_lines(series, "vehicles", "milliseconds a flock step"), folder / "training_time")
     cycles = Scenario().max_cycles
     lines_ = [
         "## Time of training\n",
@@ -297,16 +298,16 @@ def _training_time(folder: Path, steps: int) -> str:
     return "\n".join([*lines_, "", "![time against vehicles](training_time.png)", "", note])
 
 
-def _seconds_per_flock_step(n_vehicles: int, update_ratio: float, steps: int) -> float:
+def _seconds_per_flock_step(n_vehicles: int, utd_ratio: float, steps: int) -> float:
     """Measured over ``steps`` vector steps of the default training, after a warm-up."""
     config = TrainingConfig()
-    learner = config.learner.replace(update_ratio=update_ratio, learning_starts=config.learner.batch_size)
-    config = config.replace(scenario=Scenario(n_vehicles=n_vehicles, n_obstacles=2), learner=learner, n_flocks=8)
+    algorithm = config.algorithm.replace(utd_ratio=utd_ratio, learning_starts=config.algorithm.batch_size)
+    config = config.replace(scenario=Scenario(n_vehicles=n_vehicles, n_obstacles=2), algorithm=algorithm, n_flocks=8)
     env = make_vec_env(config.scenario, config.n_flocks, seed=0)
     try:
         model = build_model(config, env)
         mixing = NeighborInclusiveReward(config.scenario.reward.lambda_)
-        model.learn(10 * env.num_envs + config.learner.batch_size, mixing)
+        model.learn(10 * env.num_envs + config.algorithm.batch_size, mixing)
         start = time.perf_counter()
         model.learn(steps * env.num_envs, mixing, reset_num_timesteps=False)
         return (time.perf_counter() - start) / (steps * config.n_flocks)

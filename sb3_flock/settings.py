@@ -1,7 +1,7 @@
-"""Settings: the base of every frozen, validated, self-describing group of parameters.
+"""Settings: the base class of every frozen, validated, self-describing group of parameters, and the errors of the package.
 
-A field's ``description`` (with its unit and source) is the only documentation of that parameter: the command line's
-``--help`` and the comments of every YAML file are made from it.
+A field's ``description`` (with its unit and the paper's value) is the only documentation of that parameter: the command
+line's ``--help`` and the comments of every YAML file are made from it.
 """
 
 from __future__ import annotations
@@ -15,26 +15,28 @@ from typing import Annotated, Any, TypeVar, get_origin
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
 
+from sb3_flock._renamed import rename_fields, rename_key, warn_renamed
+
 _Settings = TypeVar("_Settings", bound="Settings")
 
 Positive = Annotated[float, Field(ge=1e-6, le=1e6)]
-"""Lengths, speeds, weights: so far from the ends of the floating point numbers that no formula here overflows."""
+"""Lengths, speeds, weights: bounded so that no formula of the package overflows."""
 NotNegative = Annotated[float, Field(ge=0, le=1e6)]
 Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
 
 
 class UserError(ValueError):
-    """Something that the user can mend; the message is one line that says what, whatever a file or a flag put into it."""
+    """A mistake that the user can correct; the message is one printable line, whatever a file or a flag put into it."""
 
     def __init__(self, message: str) -> None:
-        super().__init__("".join(letter if letter.isprintable() else "?" for letter in message[:_LONGEST_MESSAGE]))
+        super().__init__("".join(letter if letter.isprintable() else "?" for letter in message[:_MAX_MESSAGE]))
 
 
-_LONGEST_MESSAGE = 2000
+_MAX_MESSAGE = 2000
 
 
 class RunError(RuntimeError):
-    """Something outside of the parameters went wrong in a run: a full disk, a dead worker, a diverged training."""
+    """A run failed for a reason outside its parameters: a full disk, a dead worker, a diverged training."""
 
 
 class SettingsError(UserError):
@@ -50,6 +52,9 @@ class Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     def __init__(self, **values: Any) -> None:
+        values, renamed = rename_fields(type(self).__name__, values)
+        for old, new in renamed:
+            warn_renamed(f"{type(self).__name__}: {old}", new, stacklevel=2)
         try:
             super().__init__(**values)
         except ValidationError as error:
@@ -64,12 +69,12 @@ class Settings(BaseModel):
 
 
 def check_integer(name: str, value: Any, least: int) -> None:
-    """Whether an argument is an integer of at least ``least``.
+    """Check that an argument is an integer of at least ``least``.
 
-    :raises SettingsError: if not
+    :raises SettingsError: if it is not
     """
     if not isinstance(value, numbers.Integral) or value < least:
-        raise SettingsError(f"{name} = {shown(value)}: input should be an integer of at least {least}")
+        raise SettingsError(f"{name} = {format_value(value)}: input should be an integer of at least {least}")
 
 
 def group_of(annotation: Any) -> type[Settings] | None:
@@ -112,14 +117,23 @@ def resolve_path(settings: type[Settings], key: str) -> tuple[str, ...]:
     hits = [path for path in paths if path[-len(wanted) :] == wanted]
     if len(hits) == 1:
         return hits[0]
+    if not hits and rename_key(key) != key:
+        found = resolve_path(settings, rename_key(key))
+        warn_renamed(key, ".".join(found), stacklevel=2)
+        return found
     if hits:
         raise SettingsError(f"{key} is ambiguous: {', '.join('.'.join(path) for path in hits)}")
-    raise SettingsError(f"{key} is not a parameter{nearest(key, ['.'.join(path) for path in paths])}")
+    raise SettingsError(f"{key} is not a parameter{suggest(key, ['.'.join(path) for path in paths])}")
 
 
-def nearest(name: str, known: Iterable[str]) -> str:
+_ALIASES = {"lr": "learning_rate", "timesteps": "total_timesteps", "n_envs": "n_flocks", "n_agents": "n_vehicles"}
+"""What other libraries call our parameters."""
+
+
+def suggest(name: str, known: Iterable[str]) -> str:
     """A hint ``; did you mean ...?`` for a mistyped name, or an empty string."""
     by_tail = {candidate.split(".")[-1]: candidate for candidate in known}
+    name = _ALIASES.get(name, name)
     by_tail.update({candidate: candidate for candidate in by_tail.values()})
     tail = name.rsplit(".", maxsplit=1)[-1]
     close = difflib.get_close_matches(name, by_tail, n=1) or difflib.get_close_matches(tail, by_tail, n=1)
@@ -130,15 +144,15 @@ def _describe(settings: type[Settings], error: Mapping[str, Any]) -> str:
     """One of pydantic's errors as ``parameter = value: what is accepted``."""
     path = ".".join(str(part) for part in error["loc"]) or settings.__name__
     if error["type"] == "extra_forbidden":
-        return f"{path} is not a parameter of {settings.__name__}{nearest(path, settings.model_fields)}"
+        return f"{path} is not a parameter of {settings.__name__}{suggest(path, settings.model_fields)}"
     if error["type"] == "value_error":  # raised by a validator of ours, which names the parameter itself
         return str(error["ctx"]["error"])
     message = error["msg"][0].lower() + error["msg"][1:]
-    return f"{path} = {shown(error['input'])}: {message}"
+    return f"{path} = {format_value(error['input'])}: {message}"
 
 
-def shown(value: Any) -> str:
-    """A value as a message shows it: short, even if it is a YAML file's million laughs."""
+def format_value(value: Any) -> str:
+    """A value as an error message shows it: shortened, even if a YAML file expands it to millions of entries."""
     return _short.repr(value)
 
 

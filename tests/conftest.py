@@ -6,6 +6,10 @@ import os
 import pytest
 import torch as th
 
+from sb3_flock import Scenario, make_vec_env, save_model
+from sb3_flock.rl.registry import build_model
+from tests.helpers import SMALL_MODEL
+
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
 
 
@@ -20,3 +24,20 @@ def _no_worker_outlives_its_test():
     yield
     for worker in multiprocessing.active_children():
         worker.kill()
+
+
+@pytest.fixture
+def scenario():
+    return Scenario()
+
+
+@pytest.fixture(scope="module")
+def model():
+    """A small untrained model."""
+    return build_model(SMALL_MODEL, make_vec_env(SMALL_MODEL.scenario, 1, seed=0))
+
+
+@pytest.fixture
+def saved(model, tmp_path):
+    """Its zip."""
+    return save_model(model, tmp_path / "policy.zip", SMALL_MODEL)

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from sb3_flock.rl.config import TrainingConfig
-from sb3_flock.rl.config_io import load_config, to_yaml
+from sb3_flock.config.training import TrainingConfig
+from sb3_flock.serialization.yaml_io import load_config, to_yaml
 
 CONFIGS = sorted(
     path for path in (Path(__file__).parents[1] / "configs").glob("*.yaml") if not path.name.startswith("sweep_")
@@ -28,5 +28,5 @@ def test_the_plain_recipe_is_the_papers():
     config = load_config(TrainingConfig, Path(__file__).parents[1] / "configs" / "paper_plain.yaml")
     reward = config.scenario.reward
     assert (reward.link_bonus, reward.separation_penalty, reward.obstacle_penalty, reward.scale) == (1, 1, 1, 1)
-    assert (config.algo, config.network.n_critics, config.learner.update_ratio) == ("ddpg", 1, 1)
-    assert config.flown_scenarios()[0].replace(obstacle_arena=None) == config.scenario
+    assert (config.algo, config.network.n_critics, config.algorithm.utd_ratio) == ("ddpg", 1, 1)
+    assert config.training_scenarios()[0].replace(obstacle_arena=None) == config.scenario

@@ -33,7 +33,7 @@ def test_another_env(tmp_path):
 
 def test_evaluating_a_policy(tmp_path):
     words = ["train", "--total-timesteps", "60", "--eval-freq", "0", "--output-dir", str(tmp_path)]
-    assert main([*words, "--set", "test_episodes=1", "--set", "buffer_size=100"]) == 0
+    assert main([*words, "--set", "n_test_episodes=1", "--set", "buffer_size=100"]) == 0
     assert run("evaluate_policy.py", tmp_path / "ddpg_3v1o_1", cwd=tmp_path).count("vehicles:") == 4
     assert (tmp_path / "evaluate_policy.png").exists()
 
@@ -46,7 +46,7 @@ def test_a_custom_extractor_trains(tmp_path):
 
 
 def test_a_policy_beside_olfati_saber(tmp_path):
-    said = run("beside_olfati_saber.py", "paper-3v1o", 10, cwd=tmp_path)
+    said = run("beside_olfati_saber.py", "ddpg-3v1o", 10, cwd=tmp_path)
     assert [line.split(":")[0].strip() for line in said.splitlines()] == ["ours", "Olfati-Saber"]
     assert (tmp_path / "beside_olfati_saber.png").read_bytes().startswith(b"\x89PNG")
 
@@ -57,7 +57,7 @@ def test_parameter_sharing(tmp_path):
     assert "[[1" in said
 
 
-@pytest.mark.parametrize("policy", ["paper-5v2o", "second-look-5v2o"])
+@pytest.mark.parametrize("policy", ["ddpg-5v2o", "ddpg-bc-5v2o"])
 def test_flying_on_board_needs_numpy_and_onnxruntime_alone(tmp_path, policy):
     assert main(["export", policy, str(tmp_path / "policy.onnx")]) == 0
     said = run("fly_onboard.py", tmp_path / "policy.onnx", cwd=tmp_path)

@@ -15,11 +15,11 @@ from hypothesis import strategies as st
 
 from sb3_flock import Scenario, TrainingConfig, load_policy, make_vec_env, save_model
 from sb3_flock.cli import _TRAIN_FLAGS, main
-from sb3_flock.rl.algorithms import build_model
-from sb3_flock.rl.config_io import load_config, to_yaml
-from sb3_flock.rl.loading import PolicyError
+from sb3_flock.rl.registry import build_model
+from sb3_flock.serialization.load import PolicyError
+from sb3_flock.serialization.yaml_io import load_config, to_yaml
 from sb3_flock.settings import SettingsError, leaf_paths
-from tests.rl.conftest import CONFIG
+from tests.helpers import SMALL_MODEL
 
 FEW, MANY = 100, 10_000
 
@@ -216,7 +216,9 @@ def test_a_million_laughs_are_refused_at_once(key):
 
 @pytest.fixture(scope="module")
 def policy_zip(tmp_path_factory):
-    config = CONFIG.replace(network=CONFIG.network.replace(channels=(1, 1), features_dim=1, net_arch=(1,), action_layer=1))
+    config = SMALL_MODEL.replace(
+        network=SMALL_MODEL.network.replace(channels=(1, 1), features_dim=1, net_arch=(1,), action_layer=1)
+    )
     model = build_model(config, make_vec_env(config.scenario, 1, seed=0))
     return save_model(model, tmp_path_factory.mktemp("policy") / "policy.zip", config).read_bytes()
 

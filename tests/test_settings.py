@@ -1,6 +1,6 @@
 import pytest
 
-from sb3_flock.rl.config import TrainingConfig
+from sb3_flock.config.training import TrainingConfig
 from sb3_flock.settings import SettingsError, leaf_paths, resolve_path
 
 
@@ -10,7 +10,7 @@ from sb3_flock.settings import SettingsError, leaf_paths, resolve_path
         ("reward.lambda_", ("scenario", "reward", "lambda_")),
         ("lambda_", ("scenario", "reward", "lambda_")),
         ("scenario.n_vehicles", ("scenario", "n_vehicles")),
-        ("gamma", ("learner", "gamma")),
+        ("gamma", ("algorithm", "gamma")),
         ("seed", ("seed",)),
     ],
 )
@@ -20,7 +20,7 @@ def test_leading_groups_may_be_left_out(key, path):
 
 @pytest.mark.parametrize(
     ("key", "hint"),
-    [("gama", "learner.gamma"), ("reward.lamda", "scenario.reward.lambda_"), ("n_vehicel", "scenario.n_vehicles")],
+    [("gama", "algorithm.gamma"), ("reward.lamda", "scenario.reward.lambda_"), ("n_vehicel", "scenario.n_vehicles")],
 )
 def test_an_unknown_key_is_refused_with_the_nearest(key, hint):
     with pytest.raises(SettingsError, match=rf"{key} is not a parameter; did you mean {hint}\?"):

@@ -1,28 +1,28 @@
-"""Flocking: vehicles follow a moving waypoint together, keep apart, avoid obstacles and stay in touch.
+"""Flocking: vehicles track a moving waypoint together, keep apart, avoid obstacles and stay within communication range.
 
 ========================  ==========================================================================================
 Import                    ``from sb3_flock import flocking_v0``; then ``pettingzoo.make("parallel", "flock/flocking-v0")``, too
 Agents                    ``vehicle_0`` ... ``vehicle_{n-1}``; all live through the whole episode
 Actions                   continuous, ``Box([0, -pi], [0.15, pi], (2,))``: speed v [m/s] and turn rate omega [rad/s]
 Observations              ``Box(0, 1e6, (3, 11, 11), float32)``: neighbors, obstacles, waypoint in the body frame; with
-                          ``look_back`` three more channels, within ``[-1e6, 1e6]``: how the first three have changed
-Rewards                   r_i of section IV-B with our weights, without the neighbors' share, which training mixes in
+                          ``motion_lag`` three motion channels more, within ``[-1e6, 1e6]``
+Rewards                   r_i of section IV-B with our weights; training mixes in the neighbors' rewards
 Termination, truncation   never terminated; all agents are truncated after ``max_cycles`` steps
 Rendering                 ``human`` (a window) and ``rgb_array``; both need pygame, the ``render`` extra
 ========================  ==========================================================================================
 
 **Observation.** ``obs[c, a, b]``: channel c (0 neighbors, 1 obstacles, 2 waypoint) at anchor a along the body's forward
 axis and b along its left axis; see :mod:`sb3_flock.sim.observation`. The shape does not depend on the number of vehicles or
-obstacles, so that a policy flies in a flock of any size.
+obstacles, so that one policy drives a flock of any size.
 
-**Reward.** The sum of four named terms: ``connectivity`` pays for each neighbor at a safe distance and fines each one that
-is too close, ``obstacle`` fines each obstacle that is too close, ``waypoint`` fines the distance to the waypoint and
-``control`` large actions.
+**Reward.** The sum of four named terms: ``connectivity`` rewards each neighbor at a safe distance and penalizes each
+separation violation, ``obstacle`` penalizes each obstacle closer than its minimum separation, ``waypoint`` penalizes the
+distance to the waypoint and ``control`` large actions.
 
 **Infos** of a step, per agent (those of a reset are empty):
 
 * ``neighbors``: indices into ``possible_agents`` of the agents within ``link_range``, ascending, as an int array;
-* ``reward_terms``: the four terms by name, floats that sum to the reward;
+* ``reward_terms``: the terms by name, floats that sum to the reward;
 * ``metrics``: ``tracking_error`` (distance to the waypoint, m), ``nearest_neighbor`` and ``nearest_obstacle`` (m; inf if
   there is none at all), ``neighbor_violation`` and ``obstacle_violation`` (whether one is closer than its minimum
   separation), ``connected`` (whether the whole flock's proximity graph is connected);
@@ -45,8 +45,8 @@ from pettingzoo.utils import wrappers
 from pettingzoo.utils.conversions import parallel_to_aec
 
 from sb3_flock.settings import SettingsError
-from sb3_flock.sim import Scenario, Sensing, World, observe, own_reward, reward_terms, sense
-from sb3_flock.sim.scenario import MAX_BODIES
+from sb3_flock.sim import Scenario, Sensing, World, observe, own_reward, reward_terms
+from sb3_flock.sim.dynamics import MAX_BODIES
 from sb3_flock.sim.sensing import is_connected, nearest
 
 Observation = NDArray[np.float32]
@@ -66,7 +66,7 @@ def raw_env(**kwargs: Any) -> AECEnv:
 def observation_space(scenario: Scenario) -> spaces.Box:
     """One vehicle's observation space; the same for any number of vehicles, so that a policy fits them all."""
     low = np.zeros(scenario.observation_shape, np.float32)
-    low[3:] = -MAX_BODIES
+    low[len(scenario.channels) :] = -MAX_BODIES  # the motion channels are differences
     return spaces.Box(low, float(MAX_BODIES), dtype=np.float32)
 
 
@@ -102,7 +102,7 @@ class parallel_env(ParallelEnv[str, Observation, Action]):  # noqa: N801 - Petti
         self._observation_spaces = {agent: observation_space(self.scenario) for agent in self.possible_agents}
         self._action_spaces = {agent: action_space(self.scenario) for agent in self.possible_agents}
         self.world = World(self.scenario, n_flocks=1)
-        self._rng: np.random.Generator | None = None
+        self.rng: np.random.Generator | None = None
         self._renderer: Any = None
 
     def observation_space(self, agent: str) -> spaces.Box:
@@ -122,10 +122,10 @@ class parallel_env(ParallelEnv[str, Observation, Action]):  # noqa: N801 - Petti
         :param options: ignored
         :return: observations and empty infos by agent
         """
-        if seed is not None or self._rng is None:
-            self._rng = np.random.default_rng(seed)
+        if seed is not None or self.rng is None:
+            self.rng = np.random.default_rng(seed)
         self.agents = list(self.possible_agents)
-        sensing = self.world.reset([self._rng])
+        sensing = self.world.reset([self.rng])
         return self._observations(sensing), {agent: {} for agent in self.agents}
 
     def step(
@@ -133,7 +133,8 @@ class parallel_env(ParallelEnv[str, Observation, Action]):  # noqa: N801 - Petti
     ) -> tuple[dict[str, Observation], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
         """Move everything by one sampling period; see the module's page for what comes back."""
         sensing, clipped = self.world.step([[actions[agent] for agent in self.agents]])
-        terms = {name: term[0] for name, term in reward_terms(sensing, clipped, self.scenario).items()}
+        by_name = reward_terms(sensing, clipped, self.scenario.reward, self.scenario)
+        terms = {name: term[0] for name, term in by_name.items()}
         truncated = self.world.steps >= self.scenario.max_cycles
         infos = self._infos(sensing, terms, truncated)
         result = (
@@ -164,18 +165,18 @@ class parallel_env(ParallelEnv[str, Observation, Action]):  # noqa: N801 - Petti
 
     def state(self) -> NDArray[np.float32]:
         """All vehicles' observations stacked, ``(vehicles, channels, l, l)``, without sensor errors and memory."""
-        return observe(sense(self.world), self.scenario)[0]
+        return observe(self.world.sense(), self.scenario)[0]
 
     def state_dict(self) -> dict[str, Any]:
-        """The episode under way and the random stream: plain values and arrays."""
-        rng = None if self._rng is None else self._rng.bit_generator.state
+        """The current episode and the random stream: plain values and arrays."""
+        rng = None if self.rng is None else self.rng.bit_generator.state
         return {"world": self.world.state_dict() if self.agents else None, "rng": rng}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on with the episode of :meth:`state_dict`; what follows is the same to the last bit."""
+        """Restore the episode of :meth:`state_dict`; what follows is equal to the last bit."""
         if state["rng"] is not None:
-            self._rng = np.random.default_rng()
-            self._rng.bit_generator.state = state["rng"]
+            self.rng = np.random.default_rng()
+            self.rng.bit_generator.state = state["rng"]
         self.agents = []
         if state["world"] is not None:
             self.world.load_state_dict(state["world"])
@@ -188,15 +189,16 @@ class parallel_env(ParallelEnv[str, Observation, Action]):  # noqa: N801 - Petti
             self._renderer = None
 
     def _observations(self, sensing: Sensing) -> dict[str, Observation]:
-        return dict(zip(self.possible_agents, observe(self._measure(sensing), self.scenario)[0], strict=True))
+        return dict(zip(self.possible_agents, observe(self.measure(sensing), self.scenario)[0], strict=True))
 
-    def _measure(self, sensing: Sensing) -> Sensing:
+    def measure(self, sensing: Sensing) -> Sensing:
+        """What the vehicles measure of what there is; the env calls it once a step, before it returns the observations."""
         return self.world.sensors.measure(sensing)
 
     def _infos(self, sensing: Sensing, terms: dict[str, NDArray[np.float64]], truncated: bool) -> dict[str, dict[str, Any]]:
         scenario = self.scenario
         positions = self.world.positions
-        nearest_neighbor = nearest(positions, positions, others=True)[0]
+        nearest_neighbor = nearest(positions, positions, exclude_self=True)[0]
         nearest_obstacle = nearest(positions, self.world.obstacle_positions)[0]
         neighbors = sensing.neighbors.by_observer()
         connected = bool(is_connected(sensing.neighbors)[0])

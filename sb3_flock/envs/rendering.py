@@ -1,4 +1,4 @@
-"""Drawing a flock with pygame: a picture, or a window."""
+"""Drawing a flock with pygame: an image, or a window."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sb3_flock.sim import sense
 from sb3_flock.sim.sensing import is_connected, nearest
 
 if TYPE_CHECKING:
@@ -27,13 +26,13 @@ SIDE = 640
 HEADER = 64
 """Height of the two lines above it: the step's metrics and the legend [pixels]. Multiples of 16 suit video codecs."""
 _MARGIN = 1.1
-"""The picture shows this many times the arena; the vehicles may leave it."""
+"""Width of the image [arenas]; the vehicles may leave the arena."""
 _FINE = 2
 """Lines are drawn this many times larger and scaled down, which smooths them."""
 _TRAIL, _WAYPOINT_PATH = 20, 400
 """Steps of a vehicle's trail and of the waypoint's path."""
 
-# Okabe and Ito's palette, told apart by the color-blind as well; shapes differ, too.
+# Okabe and Ito's palette, distinguishable by color-blind readers; shapes differ as well.
 _BACKGROUND = (255, 255, 255)
 _GRID = (225, 225, 225)
 _TEXT = (60, 60, 60)
@@ -51,8 +50,8 @@ Pixels = tuple[float, float]
 class Renderer:
     """Draws the first flock of a world.
 
-    A vehicle is an arrowhead in a disc of half its minimum separation r_n' (discs that overlap are too close) in a ring of its
-    link range r_n, with its trail behind it; one that is too close to anything is orange. Lines are links of the proximity
+    A vehicle is an arrowhead in a disc of half its minimum separation r_n' (overlapping discs are a violation) in a ring of its
+    link range r_n, with its trail behind it; one that violates a separation is orange. Lines are links of the proximity
     graph, obstacles are squares in a ring of their minimum separation r_o', the waypoint is a cross with its path.
 
     :param scenario: the task
@@ -74,36 +73,36 @@ class Renderer:
         self._waypoints: deque[NDArray[np.float64]] = deque(maxlen=_WAYPOINT_PATH)
 
     def draw(self, world: World) -> NDArray[np.uint8] | None:
-        """The picture, ``(height, width, 3)``, or ``None`` after showing it in the window."""
+        """The image, ``(height, width, 3)``, or ``None`` after showing it in the window."""
         if self.render_mode == "human":
-            self._show(self.paint(world))
+            self._show(self.draw_surface(world))
             return None
-        return self.picture(world)
+        return self.image(world)
 
-    def picture(self, world: World) -> NDArray[np.uint8]:
-        """The picture, ``(height, width, 3)``."""
-        return np.ascontiguousarray(pygame.surfarray.array3d(self.paint(world)).swapaxes(0, 1))
+    def image(self, world: World) -> NDArray[np.uint8]:
+        """The image, ``(height, width, 3)``."""
+        return np.ascontiguousarray(pygame.surfarray.array3d(self.draw_surface(world)).swapaxes(0, 1))
 
-    def paint(self, world: World) -> pygame.Surface:
-        """The picture as a surface of ``SIDE`` x ``HEADER + SIDE`` pixels."""
-        self._remember(world)
-        sensing = sense(world)
+    def draw_surface(self, world: World) -> pygame.Surface:
+        """The image as a surface of ``SIDE`` x ``HEADER + SIDE`` pixels."""
+        self._keep_paths(world)
+        sensing = world.sense()
         picture = pygame.Surface((SIDE, HEADER + SIDE))
         picture.fill(_BACKGROUND)
-        self._paint_arena(world, sensing)
+        self._draw_arena(world, sensing)
         picture.blit(pygame.transform.smoothscale(self._fine, (SIDE, SIDE)), (0, HEADER))
-        self._paint_metrics(picture, world, sensing)
-        self._paint_legend(picture)
+        self._draw_metrics(picture, world, sensing)
+        self._draw_legend(picture)
         return picture
 
     def position_at(self, pixels: Pixels) -> NDArray[np.float64]:
-        """The place in the world [m] under a pixel of the picture."""
+        """The position in the world [m] under a pixel of the image."""
         x, y = pixels[0] * _FINE, (pixels[1] - HEADER) * _FINE
         half = SIDE * _FINE / 2
         return np.array([x - half, half - y]) / self._scale
 
     def pixels_of(self, position: NDArray[np.float64]) -> Pixels:
-        """The pixel of the picture over a place in the world [m]."""
+        """The pixel of the image over a position in the world [m]."""
         x, y = self._pixels(position)
         return x / _FINE, y / _FINE + HEADER
 
@@ -123,8 +122,8 @@ class Renderer:
         pygame.display.flip()
         self._clock.tick(self.fps)
 
-    def _remember(self, world: World) -> None:
-        """Where vehicles and waypoint were, since the episode began; vehicles may have come or gone."""
+    def _keep_paths(self, world: World) -> None:
+        """Keep the paths since the start of the episode; they start anew when the number of vehicles changes."""
         if world.steps < self._steps or (self._trails and len(self._trails[-1]) != world.scenario.n_vehicles):
             self._trails.clear()
             self._waypoints.clear()
@@ -135,7 +134,7 @@ class Renderer:
 
     # -- the arena, in fine pixels -----------------------------------------------------------------------------------
 
-    def _paint_arena(self, world: World, sensing: Sensing) -> None:
+    def _draw_arena(self, world: World, sensing: Sensing) -> None:
         scenario, canvas = world.scenario, self._fine
         canvas.fill(_BACKGROUND)
         side = 2 * self._arena * self._scale
@@ -143,7 +142,7 @@ class Renderer:
 
         positions, headings = world.positions[0], world.headings[0]
         close = sensing.neighbors.count(scenario.neighbor_separation) + sensing.obstacles.count(scenario.obstacle_separation)
-        colors = [_VIOLATION if too_close else _VEHICLE for too_close in close[0]]
+        colors = [_VIOLATION if violates else _VEHICLE for violates in close[0]]
         disc, ring = (self._scale * reach for reach in (scenario.neighbor_separation / 2, scenario.link_range))
         for position in positions:
             pygame.draw.circle(canvas, _GRID, self._pixels(position), ring, width=_FINE)
@@ -180,14 +179,14 @@ class Renderer:
 
     # -- the header --------------------------------------------------------------------------------------------------
 
-    def _paint_metrics(self, picture: pygame.Surface, world: World, sensing: Sensing) -> None:
+    def _draw_metrics(self, picture: pygame.Surface, world: World, sensing: Sensing) -> None:
         scenario, positions = world.scenario, world.positions
         words = [
             (f"{world.steps * scenario.time_step:.1f} s", False),
             (f"tracking error {sensing.waypoint_distances.mean():#.3g} m", False),
         ]
         bodies = (
-            ("nearest neighbor", nearest(positions, positions, others=True), scenario.neighbor_separation),
+            ("nearest neighbor", nearest(positions, positions, exclude_self=True), scenario.neighbor_separation),
             ("obstacle", nearest(positions, world.obstacle_positions), scenario.obstacle_separation),
         )
         for name, distances, separation in bodies:
@@ -201,7 +200,7 @@ class Renderer:
             picture.blit(text, (x, 10))
             x += text.get_width() + 14
 
-    def _paint_legend(self, picture: pygame.Surface) -> None:
+    def _draw_legend(self, picture: pygame.Surface) -> None:
         fine = pygame.Surface((SIDE * _FINE, HEADER * _FINE // 2))
         fine.fill(_BACKGROUND)
         y, words = fine.get_height() / 2, []
@@ -220,7 +219,7 @@ class Renderer:
         pygame.draw.line(fine, _LINK, (x - 9 * _FINE, y), (x + 9 * _FINE, y), width=2 * _FINE)
         name("link", after=14)
         _arrowhead(fine, (x, y), np.pi / 2, 8 * _FINE, _VIOLATION)
-        name("too close", after=12)
+        name("violation", after=12)
         pygame.draw.circle(fine, _OBSTACLE, (x, y), 9 * _FINE, width=2 * _FINE)
         _square(fine, (x, y), 5 * _FINE)
         name("obstacle, r_o'", after=14)

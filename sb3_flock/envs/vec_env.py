@@ -1,4 +1,4 @@
-"""The SuperSuit flattening of a PettingZoo env into one SB3 vector env with shared parameters, its gaps mended.
+"""The SuperSuit flattening of a PettingZoo env into one SB3 vector env with shared parameters, with its defects fixed.
 
 Every agent of every copy becomes one slot of the vector env, copy by copy: slot ``copy * n_agents + i`` is the copy's agent
 ``possible_agents[i]``, and its action goes to that agent alone. One policy serves all slots: that is parameter sharing.
@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 from supersuit.vector.concat_vec_env import ConcatVecEnv
-from supersuit.vector.multiproc_vec import ProcConcatVec, numpy_deepcopy
+from supersuit.vector.multiproc_vec import ProcConcatVec
 from supersuit.vector.sb3_vector_wrapper import SB3VecEnvWrapper
 
+from sb3_flock._compat import copies_in_process, is_multiprocess, reset_workers
 from sb3_flock.envs import flocking_v0
 from sb3_flock.settings import RunError, check_integer
 from sb3_flock.sim import Scenario
@@ -65,7 +66,7 @@ def flatten(env: ParallelEnv, n_copies: int = 1, num_cpus: int = 0, seed: int | 
 
 
 class ParameterSharingVecEnv(SB3VecEnvWrapper):
-    """SuperSuit's SB3 wrapper with its gaps mended; use :func:`make_vec_env` or :func:`flatten` to build one.
+    """SuperSuit's SB3 wrapper with its defects fixed; use :func:`make_vec_env` or :func:`flatten` to build one.
 
     What it adds: seeds that reproduce and that differ between copies, with and without workers; ``TimeLimit.truncated``
     wherever an episode is cut and not ended; boolean ``dones``; SB3's ``get_attr``, ``set_attr`` and ``env_method`` (without
@@ -76,12 +77,12 @@ class ParameterSharingVecEnv(SB3VecEnvWrapper):
 
     def __init__(self, venv: ConcatVecEnv | ProcConcatVec, example: ParallelEnv) -> None:
         self.n_agents = len(example.possible_agents)
-        if isinstance(venv, ProcConcatVec):
+        if is_multiprocess(venv):
             venv.render_mode = example.unwrapped.render_mode
         super().__init__(venv)
         self.metadata = venv.metadata
         self.reset_infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        self._has_workers = isinstance(venv, ProcConcatVec)
+        self._has_workers = is_multiprocess(venv)
         self._seed: int | None = None
         self._unseeded = True
         self._options: dict[str, Any] | None = None
@@ -107,7 +108,7 @@ class ParameterSharingVecEnv(SB3VecEnvWrapper):
         if seed is not None:
             self.seed(seed)
         if self._seed is None and not self._unseeded:
-            first = None  # every copy's own stream goes on
+            first = None  # every copy's own stream continues
         else:
             # SuperSuit hands copy i the seed `first + i`; hashing keeps the copies of neighboring seeds apart.
             first = int(np.random.SeedSequence(self._seed).generate_state(1)[0]) // 2
@@ -119,14 +120,9 @@ class ParameterSharingVecEnv(SB3VecEnvWrapper):
         return observations
 
     def _reset_workers(self, seed: int | None, options: dict[str, Any] | None) -> tuple[Any, list[dict[str, Any]]]:
-        """Seed the workers' copies as if they were in this process; SuperSuit would let their seeds overlap."""
-        for pipe, start in zip(self.venv.pipes, self.venv.idx_starts, strict=False):
-            pipe.send(("reset", (None if seed is None else seed + start // self.n_agents, options)))
-        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        for start, compressed in zip(self.venv.idx_starts, self.venv._receive_info(), strict=False):
-            for slot, info in compressed:
-                infos[start + slot] = info
-        return numpy_deepcopy(self.venv.observations_buffers), infos
+        """Seed the workers' copies as if they were in this process."""
+        seeds = (None if seed is None else seed + start // self.n_agents for start in self.venv.idx_starts)
+        return reset_workers(self.venv, seeds, options, self.num_envs)
 
     # -- stepping ----------------------------------------------------------------------------------------------------
 
@@ -176,20 +172,20 @@ class ParameterSharingVecEnv(SB3VecEnvWrapper):
                 pipe.recv()
                 pipe.send("terminate")
             except (EOFError, OSError):
-                proc.kill()  # it is dead, or not listening
+                proc.kill()  # it is dead, or does not answer
             proc.join(self.venv.graceful_shutdown_timeout)
         self.venv.close()
 
-    # -- going on elsewhere ------------------------------------------------------------------------------------------
+    # -- state --------------------------------------------------------------------------------------------------------
 
     def state_dict(self) -> list[dict[str, Any]] | None:
-        """The episodes under way and the random streams of every copy, or ``None`` where workers keep them."""
+        """The current episodes and the random streams of every copy, or ``None`` where workers hold them."""
         if self._has_workers:
             return None
         return [env.unwrapped.state_dict() for env in self._copies(range(0, self.num_envs, self.n_agents))]
 
     def load_state_dict(self, state: Sequence[Mapping[str, Any]]) -> None:
-        """Go on with the episodes of :meth:`state_dict`; the next reset starts no stream anew."""
+        """Restore the episodes of :meth:`state_dict`; the next reset continues their random streams."""
         for env, saved in zip(self._copies(range(0, self.num_envs, self.n_agents)), state, strict=True):
             env.unwrapped.load_state_dict(saved)
         self._seed, self._unseeded = None, False
@@ -224,13 +220,13 @@ class ParameterSharingVecEnv(SB3VecEnvWrapper):
         return [False for _ in self._get_indices(indices)]
 
     def get_images(self) -> list[NDArray[np.uint8] | None]:
-        """One picture a copy, or of the first copy alone with workers."""
+        """One image per copy, or of the first copy alone with workers."""
         if self._has_workers:
             return [self.render()]
         return [env.render() for env in self._copies(range(0, self.num_envs, self.n_agents))]
 
     def render(self, mode: str | None = None) -> NDArray[np.uint8] | None:
-        """Draw the first copy in the render mode it was made with; ``mode`` is there for SB3's sake and must agree."""
+        """Draw the first copy in the render mode it was made with; ``mode`` exists for SB3's interface and must agree."""
         if mode is not None and mode != self.render_mode:
             warnings.warn(f"mode {mode!r} is ignored: the env was made with render_mode={self.render_mode!r}", stacklevel=2)
         with self._guarded():
@@ -243,5 +239,6 @@ class ParameterSharingVecEnv(SB3VecEnvWrapper):
     def _copies(self, indices: Any) -> Iterable[ParallelEnv]:
         if self._has_workers:
             raise NotImplementedError("SuperSuit's workers give no access to their envs: use num_cpus=0")
+        copies = copies_in_process(self.venv)
         for slot in self._get_indices(indices):
-            yield self.venv.vec_envs[slot // self.n_agents].par_env
+            yield copies[slot // self.n_agents]

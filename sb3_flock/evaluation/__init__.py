@@ -1,6 +1,15 @@
-"""Flying policies and judging the flights; it never trains one."""
+"""Rollouts of policies and controllers, metrics and their tables."""
 
-from sb3_flock.evaluation.episodes import Controller, PolicyController, evaluate, fly
-from sb3_flock.evaluation.metrics import METRICS, EpisodeMetrics, Metric, summarize
+from sb3_flock.evaluation.metrics import METRICS, EpisodeMetric, EpisodeMetrics, Metric, register_metric, summarize
+from sb3_flock.evaluation.rollout import evaluate, rollout
 
-__all__ = ["METRICS", "Controller", "EpisodeMetrics", "Metric", "PolicyController", "evaluate", "fly", "summarize"]
+__all__ = [
+    "METRICS",
+    "EpisodeMetric",
+    "EpisodeMetrics",
+    "Metric",
+    "evaluate",
+    "register_metric",
+    "rollout",
+    "summarize",
+]

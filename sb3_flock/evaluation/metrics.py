@@ -1,12 +1,20 @@
-"""Metrics of a flight: what each number means, gathered step by step, one value an episode, then a mean with its interval.
+"""Metrics: each is one class with its name, unit, direction, description and table column, computed step by step.
 
-All thresholds are strict. The settled window is the second half of the episode, k = T/2 + 1 ... T. A metric that an episode
-does not define (pairs of a lone vehicle, obstacles where there are none) is NaN there and left out of the mean.
+A metric has one value per episode; results are means over episodes with intervals. All thresholds are strict. The steady
+state is the second half of an episode, k = T/2 + 1 ... T. A metric that an episode does not define (pairs of a single vehicle,
+obstacles where there are none) is NaN there and left out of the mean.
+
+A further metric is a subclass of :class:`EpisodeMetric` passed to :func:`register_metric`: it then appears in every table,
+JSON file and log.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,107 +22,376 @@ from numpy.typing import NDArray
 from sb3_flock.sim import Scenario, Sensing, World
 from sb3_flock.sim.sensing import distance_blocks, is_connected, nearest
 
-METRICS = {
-    "tracking_error": "mean distance vehicle to waypoint over vehicles and settled steps [m]",
-    "tracking_error_episode": "the same over the whole episode [m]",
-    "min_separation_obstacles": "the episode's smallest distance vehicle to obstacle [m]",
-    "encounter_min_separation_obstacles": "the same, over episodes in which an obstacle came within detection range [m]",
-    "min_separation_neighbors": "the episode's smallest distance between two vehicles [m]",
-    "mean_separation": "mean distance over all pairs and settled steps [m]",
-    "mean_separation_linked": "mean distance over linked pairs and settled steps [m]",
-    "obstacle_violation_rate": "share of vehicle-steps with an obstacle closer than its minimum separation",
-    "neighbor_violation_rate": "share of vehicle-steps with a vehicle closer than its minimum separation",
-    "connectivity": "share of settled steps whose proximity graph is connected",
-    "success_rate": "share of episodes without violation that end connected, each vehicle within link range of the waypoint",
-    "return": "undiscounted sum of a vehicle's own reward, mean over vehicles",
-}
-"""Every metric by name, in the order of the tables."""
-
-MINIMA = ("min_separation_obstacles", "encounter_min_separation_obstacles", "min_separation_neighbors")
-"""Metrics whose worst episode is reported too."""
-
-LARGER_IS_BETTER = (*MINIMA, "connectivity", "success_rate", "return")
-"""Metrics of which more is better; of all others, and of :func:`score`, less."""
+Values = NDArray[np.float64]
 
 _RESAMPLES = 10_000
 _CONFIDENCE = 0.95
 
 
-class EpisodeMetrics:
-    """Gathers the metrics of one batch of episodes flown in lockstep, in bounded memory.
+class Step:
+    """The state after one step of a batch of episodes, with what several metrics need computed once.
 
-    :param scenario: the task flown
-    :param n_flocks: episodes in the batch
+    :param world: the world after the step
+    :param sensing: what was sensed there, without sensor errors
+    :param rewards: r_i of the step, ``(flocks, vehicles)``
+    :param number: number k of the step, from 1
+    """
+
+    def __init__(self, world: World, sensing: Sensing, rewards: Values, number: int) -> None:
+        self.world, self.sensing, self.rewards, self.number = world, sensing, rewards, number
+
+    @property
+    def is_steady_state(self) -> bool:
+        """Whether the step is in the second half of the episode."""
+        return 2 * self.number > self.world.scenario.max_cycles
+
+    @cached_property
+    def _pairs(self) -> tuple[Values, Values]:
+        """Smallest distance and sum of distances over all pairs of vehicles, ``(flocks,)`` each [m]."""
+        positions = self.world.positions
+        smallest, total = np.full(len(positions), np.inf), np.zeros(len(positions))
+        for _, distances in distance_blocks(positions, positions, exclude_self=True):
+            by_flock = distances.reshape(len(positions), -1)
+            np.minimum(smallest, by_flock.min(-1), out=smallest)
+            if self.is_steady_state:  # each pair counts from both sides
+                total += np.where(np.isfinite(by_flock), by_flock, 0.0).sum(-1) / 2
+        return smallest, total
+
+    @property
+    def smallest_pair_distance(self) -> Values:
+        """Smallest distance between two vehicles, ``(flocks,)`` [m]; inf for a single vehicle."""
+        return self._pairs[0]
+
+    @property
+    def sum_of_pair_distances(self) -> Values:
+        """Sum of the distances of all pairs, ``(flocks,)`` [m]; in the steady state alone."""
+        return self._pairs[1]
+
+    @cached_property
+    def smallest_obstacle_distance(self) -> Values:
+        """Smallest distance of a vehicle to an obstacle, ``(flocks,)`` [m]; inf without obstacles."""
+        return nearest(self.world.positions, self.world.obstacle_positions).min(-1)
+
+    @cached_property
+    def neighbor_violations(self) -> Values:
+        """Number of vehicles with a neighbor closer than the minimum separation, ``(flocks,)``."""
+        return (self.sensing.neighbors.count(self.world.scenario.neighbor_separation) > 0).sum(-1).astype(np.float64)
+
+    @cached_property
+    def obstacle_violations(self) -> Values:
+        """Number of vehicles with an obstacle closer than the minimum separation, ``(flocks,)``."""
+        return (self.sensing.obstacles.count(self.world.scenario.obstacle_separation) > 0).sum(-1).astype(np.float64)
+
+    @cached_property
+    def connected(self) -> NDArray[np.bool_]:
+        """Whether the proximity graph is connected, ``(flocks,)``."""
+        return is_connected(self.sensing.neighbors)
+
+
+class EpisodeMetric(ABC):
+    """One metric over a batch of episodes that are simulated in lockstep.
+
+    :param scenario: the task
+    :param n_flocks: number of episodes in the batch
+    """
+
+    name: ClassVar[str]
+    unit: ClassVar[str] = ""
+    """``"m"``, or ``""`` for a number without unit."""
+    better: ClassVar[Literal["lower", "higher"]]
+    description: ClassVar[str]
+    is_rate: ClassVar[bool] = False
+    """Whether it is a fraction, which tables show in percent."""
+    is_minimum: ClassVar[bool] = False
+    """Whether it is a smallest distance; its worst episode is reported too."""
+    column: ClassVar[str | None] = None
+    """Heading in narrow tables; ``None`` leaves it out of them."""
+
+    @classmethod
+    def format(cls, value: float) -> str:
+        """A value as tables show it."""
+        return f"{value:.2%}" if cls.is_rate else f"{value:.3f}"
+
+    def __init__(self, scenario: Scenario, n_flocks: int) -> None:
+        self.scenario, self.n_flocks = scenario, n_flocks
+
+    @abstractmethod
+    def update(self, step: Step) -> None:
+        """Take in the state after one step."""
+
+    @abstractmethod
+    def result(self) -> Values:
+        """The metric's value in each episode, ``(flocks,)``, NaN where it is not defined."""
+
+    def _undefined(self) -> Values:
+        return np.full(self.n_flocks, np.nan)
+
+    @property
+    def _n_pairs(self) -> int:
+        return self.scenario.n_vehicles * (self.scenario.n_vehicles - 1) // 2
+
+
+METRICS: dict[str, type[EpisodeMetric]] = {}
+"""Every metric by name, in the order of the tables."""
+
+_Metric = TypeVar("_Metric", bound=type[EpisodeMetric])
+
+
+def register_metric(metric: _Metric) -> _Metric:
+    """Add a metric to every table, as a decorator.
+
+    :raises ValueError: if another metric has the name already
+    """
+    if METRICS.setdefault(metric.name, metric) is not metric:
+        raise ValueError(f"metric {metric.name!r} is registered already")
+    return metric
+
+
+class _Mean(EpisodeMetric):
+    """Sum of a value per step over the sum of its weights; NaN where they are 0."""
+
+    steady_state_only: ClassVar[bool] = True
+
+    def __init__(self, scenario: Scenario, n_flocks: int) -> None:
+        super().__init__(scenario, n_flocks)
+        self._total, self._weight = np.zeros(n_flocks), np.zeros(n_flocks)
+
+    def update(self, step: Step) -> None:
+        if step.is_steady_state or not self.steady_state_only:
+            self._total += self.value(step)
+            self._weight += self.weight(step)
+
+    @abstractmethod
+    def value(self, step: Step) -> Values:
+        """The step's contribution, ``(flocks,)``."""
+
+    def weight(self, step: Step) -> Values | float:
+        """The step's weight."""
+        return float(self.scenario.n_vehicles)
+
+    def result(self) -> Values:
+        with np.errstate(invalid="ignore"):
+            return self._total / self._weight
+
+
+class _Minimum(EpisodeMetric):
+    """Smallest value over all steps."""
+
+    unit, better, is_minimum = "m", "higher", True
+
+    def __init__(self, scenario: Scenario, n_flocks: int) -> None:
+        super().__init__(scenario, n_flocks)
+        self._smallest = np.full(n_flocks, np.inf)
+
+    def update(self, step: Step) -> None:
+        np.minimum(self._smallest, self.value(step), out=self._smallest)
+
+    @abstractmethod
+    def value(self, step: Step) -> Values:
+        """The step's value, ``(flocks,)`` [m]."""
+
+
+@register_metric
+class TrackingError(_Mean):
+    """Mean distance to the waypoint in the steady state."""
+
+    name, unit, better, column = "tracking_error", "m", "lower", "tracking"
+    description = "mean distance vehicle to waypoint over vehicles and steady-state steps [m]"
+
+    def value(self, step: Step) -> Values:
+        return step.sensing.waypoint_distances.sum(-1)
+
+
+@register_metric
+class EpisodeTracking(TrackingError):
+    """Mean distance to the waypoint in the whole episode."""
+
+    name, column = "tracking_error_episode", None
+    description = "the same over the whole episode [m]"
+    steady_state_only = False
+
+
+@register_metric
+class MinSeparationObstacles(_Minimum):
+    """Smallest distance to an obstacle."""
+
+    name = "min_separation_obstacles"
+    description = "smallest distance vehicle to obstacle in the episode [m]"
+
+    def value(self, step: Step) -> Values:
+        return step.smallest_obstacle_distance
+
+    def result(self) -> Values:
+        return self._smallest if self.scenario.n_obstacles else self._undefined()
+
+
+@register_metric
+class EncounterMinSeparationObstacles(MinSeparationObstacles):
+    """Smallest distance to an obstacle, in episodes with an encounter."""
+
+    name = "encounter_min_separation_obstacles"
+    description = "the same, over episodes in which an obstacle came within detection range [m]"
+
+    def result(self) -> Values:
+        return np.where(self._smallest < self.scenario.detection_range, super().result(), np.nan)
+
+
+@register_metric
+class MinSeparationNeighbors(_Minimum):
+    """Smallest distance between two vehicles."""
+
+    name = "min_separation_neighbors"
+    description = "smallest distance between two vehicles in the episode [m]"
+
+    def value(self, step: Step) -> Values:
+        return step.smallest_pair_distance
+
+    def result(self) -> Values:
+        return self._smallest if self._n_pairs else self._undefined()
+
+
+@register_metric
+class MeanSeparation(_Mean):
+    """Mean distance over all pairs of vehicles."""
+
+    name, unit, better = "mean_separation", "m", "lower"
+    description = "mean distance over all pairs and steady-state steps [m]"
+
+    def value(self, step: Step) -> Values:
+        return step.sum_of_pair_distances
+
+    def weight(self, step: Step) -> float:
+        return float(self._n_pairs)
+
+
+@register_metric
+class MeanSeparationLinked(_Mean):
+    """Mean distance over linked pairs of vehicles."""
+
+    name, unit, better = "mean_separation_linked", "m", "lower"
+    description = "mean distance over linked pairs and steady-state steps [m]"
+
+    def value(self, step: Step) -> Values:
+        return step.sensing.neighbors.sum(step.sensing.neighbors.distances).sum(-1) / 2
+
+    def weight(self, step: Step) -> Values:
+        return step.sensing.neighbors.count().sum(-1) / 2
+
+
+@register_metric
+class ObstacleViolationRate(_Mean):
+    """Share of vehicle-steps that violate the separation to obstacles."""
+
+    name, better, is_rate, column = "obstacle_violation_rate", "lower", True, "obstacle viol."
+    description = "share of vehicle-steps with an obstacle closer than its minimum separation"
+    steady_state_only = False
+
+    def value(self, step: Step) -> Values:
+        return step.obstacle_violations
+
+    def result(self) -> Values:
+        return super().result() if self.scenario.n_obstacles else self._undefined()
+
+
+@register_metric
+class NeighborViolationRate(_Mean):
+    """Share of vehicle-steps that violate the separation to neighbors."""
+
+    name, better, is_rate, column = "neighbor_violation_rate", "lower", True, "neighbor viol."
+    description = "share of vehicle-steps with a vehicle closer than its minimum separation"
+    steady_state_only = False
+
+    def value(self, step: Step) -> Values:
+        return step.neighbor_violations
+
+    def result(self) -> Values:
+        return super().result() if self._n_pairs else self._undefined()
+
+
+@register_metric
+class Connectivity(_Mean):
+    """Share of steps with a connected proximity graph."""
+
+    name, better, is_rate, column = "connectivity", "higher", True, "connected"
+    description = "share of steady-state steps whose proximity graph is connected"
+
+    def value(self, step: Step) -> Values:
+        return step.connected.astype(np.float64)
+
+    def weight(self, step: Step) -> float:
+        return 1.0
+
+
+@register_metric
+class SuccessRate(EpisodeMetric):
+    """Share of episodes without any violation that end connected at the waypoint."""
+
+    name, better, is_rate = "success_rate", "higher", True
+    description = "share of episodes without violation that end connected, each vehicle within link range of the waypoint"
+
+    def __init__(self, scenario: Scenario, n_flocks: int) -> None:
+        super().__init__(scenario, n_flocks)
+        self._violated, self._arrived = np.zeros(n_flocks, dtype=bool), np.zeros(n_flocks, dtype=bool)
+
+    def update(self, step: Step) -> None:
+        self._violated |= (step.neighbor_violations > 0) | (step.obstacle_violations > 0)
+        if step.is_steady_state:
+            near = (step.sensing.waypoint_distances < self.scenario.link_range).all(-1)
+            self._arrived = step.connected & near
+
+    def result(self) -> Values:
+        return (self._arrived & ~self._violated).astype(np.float64)
+
+
+@register_metric
+class Return(EpisodeMetric):
+    """Undiscounted return of the own reward r_i."""
+
+    name, better = "return", "higher"
+    description = "undiscounted sum of a vehicle's own reward, mean over vehicles"
+
+    @classmethod
+    def format(cls, value: float) -> str:
+        """A value as tables show it."""
+        return f"{value:.1f}"
+
+    def __init__(self, scenario: Scenario, n_flocks: int) -> None:
+        super().__init__(scenario, n_flocks)
+        self._total = np.zeros(n_flocks)
+
+    def update(self, step: Step) -> None:
+        self._total += step.rewards.sum(-1)
+
+    def result(self) -> Values:
+        return self._total / self.scenario.n_vehicles
+
+
+def is_higher_better(name: str) -> bool:
+    """Whether more is better of a metric; of :func:`score` less is."""
+    return name in METRICS and METRICS[name].better == "higher"
+
+
+class EpisodeMetrics:
+    """Every metric of one batch of episodes, in bounded memory.
+
+    :param scenario: the task
+    :param n_flocks: number of episodes in the batch
     """
 
     def __init__(self, scenario: Scenario, n_flocks: int) -> None:
-        self.scenario = scenario
-        self.steps = 0
-        self.settled_steps = 0
-        self._sums = {
-            name: np.zeros(n_flocks)
-            for name in (
-                "distance", "settled_distance", "pair", "linked", "n_linked", "obstacle_hits", "neighbor_hits",
-                "connected", "return",
-            )
-        }  # fmt: skip
-        self._min_neighbors = np.full(n_flocks, np.inf)
-        self._min_obstacles = np.full(n_flocks, np.inf)
-        self._arrived = np.zeros(n_flocks, dtype=bool)
+        self._metrics = [metric(scenario, n_flocks) for metric in METRICS.values()]
+        self._steps = 0
 
-    def update(self, world: World, sensing: Sensing, rewards: NDArray[np.float64]) -> None:
-        """Take in the state after one step, what was sensed there and its rewards ``(flocks, vehicles)``."""
-        scenario, sums, positions = self.scenario, self._sums, world.positions
-        self.steps += 1
-        settled = 2 * self.steps > scenario.max_cycles
-        distances = sensing.waypoint_distances
-        for _, to_neighbors in distance_blocks(positions, positions, others=True):
-            by_flock = to_neighbors.reshape(len(positions), -1)
-            np.minimum(self._min_neighbors, by_flock.min(-1), out=self._min_neighbors)
-            if settled:  # each pair is seen from both sides
-                sums["pair"] += np.where(np.isfinite(by_flock), by_flock, 0.0).sum(-1) / 2
-        to_obstacle = nearest(positions, world.obstacle_positions).min(-1)
-        np.minimum(self._min_obstacles, to_obstacle, out=self._min_obstacles)
-        sums["distance"] += distances.sum(-1)
-        sums["neighbor_hits"] += (sensing.neighbors.count(scenario.neighbor_separation) > 0).sum(-1)
-        sums["obstacle_hits"] += (sensing.obstacles.count(scenario.obstacle_separation) > 0).sum(-1)
-        sums["return"] += rewards.sum(-1)
-        if not settled:
-            return
-        self.settled_steps += 1
-        sums["settled_distance"] += distances.sum(-1)
-        sums["linked"] += sensing.neighbors.sum(sensing.neighbors.distances).sum(-1) / 2
-        sums["n_linked"] += sensing.neighbors.count().sum(-1) / 2
-        connected = is_connected(sensing.neighbors)
-        sums["connected"] += connected
-        self._arrived = connected & (distances < scenario.link_range).all(-1)
+    def update(self, world: World, sensing: Sensing, rewards: Values) -> None:
+        """Take in the state after one step, what was sensed there and the rewards r_i, ``(flocks, vehicles)``."""
+        self._steps += 1
+        step = Step(world, sensing, rewards, self._steps)
+        for metric in self._metrics:
+            metric.update(step)
 
-    def result(self) -> dict[str, NDArray[np.float64]]:
-        """Every metric's value for each episode, ``(flocks,)`` each, NaN where it is not defined."""
-        n, sums = self.scenario.n_vehicles, self._sums
-        n_pairs = n * (n - 1) // 2
-        vehicle_steps = n * self.steps
-        undefined = np.full(len(self._arrived), np.nan)
-        has_pairs, has_obstacles = n_pairs > 0, self.scenario.n_obstacles > 0
-        min_obstacles = self._min_obstacles if has_obstacles else undefined
-        encounter = min_obstacles < self.scenario.detection_range
-        violated = (sums["neighbor_hits"] > 0) | (sums["obstacle_hits"] > 0)
-        with np.errstate(invalid="ignore"):
-            mean_linked = sums["linked"] / sums["n_linked"]  # 0 / 0 where no pair was ever linked
-        return {
-            "tracking_error": sums["settled_distance"] / (n * self.settled_steps),
-            "tracking_error_episode": sums["distance"] / vehicle_steps,
-            "min_separation_obstacles": min_obstacles,
-            "encounter_min_separation_obstacles": np.where(encounter, min_obstacles, np.nan),
-            "min_separation_neighbors": self._min_neighbors if has_pairs else undefined,
-            "mean_separation": sums["pair"] / (n_pairs * self.settled_steps) if has_pairs else undefined,
-            "mean_separation_linked": mean_linked,
-            "obstacle_violation_rate": sums["obstacle_hits"] / vehicle_steps if has_obstacles else undefined,
-            "neighbor_violation_rate": sums["neighbor_hits"] / vehicle_steps if has_pairs else undefined,
-            "connectivity": sums["connected"] / self.settled_steps,
-            "success_rate": (self._arrived & ~violated).astype(np.float64),
-            "return": sums["return"] / n,
-        }
+    def result(self) -> dict[str, Values]:
+        """Every metric's value in each episode, ``(flocks,)`` each, NaN where it is not defined."""
+        return {metric.name: metric.result() for metric in self._metrics}
 
 
 @dataclass(frozen=True)
@@ -125,20 +402,20 @@ class Metric:
     low: float | None
     high: float | None
     n: int
-    """Episodes that define it."""
+    """Number of episodes that define it."""
     worst: float | None = None
-    """The worst episode, for the minima alone."""
+    """The worst episode, for smallest distances alone."""
 
 
-def summarize(values: dict[str, NDArray[np.float64]]) -> dict[str, Metric]:
+def summarize(values: Mapping[str, Values]) -> dict[str, Metric]:
     """Unweighted means over episodes, with 95 % percentile bootstrap intervals over episodes (10 000 resamples).
 
-    :param values: a value per episode for each metric, NaN where undefined
+    :param values: one value per episode for each metric, NaN where undefined
     """
-    return {name: _metric(name, per_episode[~np.isnan(per_episode)]) for name, per_episode in values.items()}
+    return {name: _summarize(name, per_episode[~np.isnan(per_episode)]) for name, per_episode in values.items()}
 
 
-def _metric(name: str, defined: NDArray[np.float64]) -> Metric:
+def _summarize(name: str, defined: Values) -> Metric:
     if len(defined) == 0:
         return Metric(None, None, None, 0)
     rng = np.random.default_rng(0)
@@ -151,21 +428,26 @@ def _metric(name: str, defined: NDArray[np.float64]) -> Metric:
     )
     tail = 50 * (1 - _CONFIDENCE)
     low, high = np.percentile(means, [tail, 100 - tail])
-    worst = float(defined.min()) if name in MINIMA else None
+    worst = float(defined.min()) if METRICS[name].is_minimum else None
     return Metric(float(defined.mean()), float(low), float(high), len(defined), worst)
 
 
-def score(means: dict[str, float]) -> float:
+def columns() -> dict[str, type[EpisodeMetric]]:
+    """The metrics of narrow tables by name: those with a ``column``."""
+    return {name: metric for name, metric in METRICS.items() if metric.column is not None}
+
+
+def score(means: Mapping[str, float]) -> float:
     """One number to choose the best of several policies by; lower is better.
 
-    ``tracking_error + 2 neighbor_violation_rate + 4 obstacle_violation_rate + 0.2 (1 - connectivity)``: a neighbor too
-    close in 1 % of the vehicle-steps weighs as much as 2 cm of tracking error. Undefined metrics count as kept.
+    ``tracking_error + 2 neighbor_violation_rate + 4 obstacle_violation_rate + 0.2 (1 - connectivity)``: neighbor violations in
+    1 % of the vehicle-steps weigh as much as 2 cm of tracking error. Undefined metrics count as perfect.
     """
-    kept = {"neighbor_violation_rate": 0.0, "obstacle_violation_rate": 0.0, "connectivity": 1.0}
-    kept.update({name: value for name, value in means.items() if name in kept and np.isfinite(value)})
+    perfect = {"neighbor_violation_rate": 0.0, "obstacle_violation_rate": 0.0, "connectivity": 1.0}
+    perfect.update({name: value for name, value in means.items() if name in perfect and np.isfinite(value)})
     return float(
         means["tracking_error"]
-        + 2 * kept["neighbor_violation_rate"]
-        + 4 * kept["obstacle_violation_rate"]
-        + 0.2 * (1 - kept["connectivity"])
+        + 2 * perfect["neighbor_violation_rate"]
+        + 4 * perfect["obstacle_violation_rate"]
+        + 0.2 * (1 - perfect["connectivity"])
     )

@@ -1,4 +1,4 @@
-"""Model cards: what is on record of a shipped policy, as JSON beside its zip."""
+"""Model cards: the record of a shipped policy, as JSON beside its zip."""
 
 from __future__ import annotations
 
@@ -12,32 +12,33 @@ from typing import Any
 import numpy as np
 import torch as th
 
-from sb3_flock.evaluation.episodes import evaluate
-from sb3_flock.rl.config import TrainingConfig
-from sb3_flock.rl.loading import load_policy, shipped_policies
-from sb3_flock.rl.saving import MEMBER
+from sb3_flock.config.training import TrainingConfig
+from sb3_flock.evaluation.rollout import evaluate
+from sb3_flock.pretrained import shipped_policies
+from sb3_flock.serialization.load import load_policy
+from sb3_flock.serialization.migrate import MEMBER
 
 CHECK_EPISODES, CHECK_SEED = 50, 7
-"""The short flight whose tracking error a card keeps, to tell whether the policy still flies as it did."""
+"""The short evaluation whose tracking error a card records: a later version checks that the policy behaves as before."""
 
 
 def read_card(name: str) -> dict[str, Any]:
-    """The card of a shipped policy: how its trainings were run, their curves and their results."""
+    """The card of a shipped policy: how its trainings were run, their learning curves and their results."""
     card: dict[str, Any] = json.loads(shipped_policies()[name].with_suffix(".json").read_text(encoding="utf-8"))
     return card
 
 
 def median_of_seeds(card: dict[str, Any]) -> dict[str, float]:
-    """The median over the trainings of each metric on record."""
+    """The median of each recorded metric over the trainings."""
     seeds = [seed["metrics"] for seed in card["seeds"]]
     columns = {name: [metrics[name] for metrics in seeds] for name in seeds[0]}
     return {name: float(np.median(values)) for name, values in columns.items() if None not in values}
 
 
 def ship(name: str, runs: Sequence[str | Path], folder: str | Path, episodes: int = 1000) -> Path:
-    """Make ``<name>.zip`` and ``<name>.json`` from trainings that differ by their seed: the best one's policy, and all results.
+    """Write ``<name>.zip`` and ``<name>.json`` from trainings that differ in their seed: the best policy, and all results.
 
-    The best is chosen by the evaluations during training; the results are of episodes that no training saw.
+    The best is chosen by the evaluations during training; the results are on separate episodes.
 
     :param runs: run folders of finished trainings
     :return: the path of the zip
@@ -77,9 +78,9 @@ def ship(name: str, runs: Sequence[str | Path], folder: str | Path, episodes: in
 
 
 def _copy_light(source: Path, target: Path) -> None:
-    """Copy a policy at a quarter of its size: numbers of half precision, once for each target network and the one it follows.
+    """Copy a policy at a quarter of its size: half precision, and the target networks as copies of the networks they follow.
 
-    Of its config the folder is left out: it was another machine's.
+    The config's ``output_dir`` is reset: it names a folder of the training machine.
     """
     with zipfile.ZipFile(source) as archive, zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as copy:
         for name in archive.namelist():

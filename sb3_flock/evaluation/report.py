@@ -1,4 +1,4 @@
-"""Evaluation results for people (a table beside the paper's figures) and for programs (JSON)."""
+"""Evaluation results as a table beside the paper's figures, and as JSON."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from rich import box
 from rich.table import Table
 
-from sb3_flock.evaluation.metrics import METRICS, MINIMA, Metric
+from sb3_flock.evaluation.metrics import METRICS, EpisodeMetric, Metric, columns
 from sb3_flock.sim import Scenario
 
 PAPER: dict[tuple[int, int], dict[str, dict[str, float]]] = {
@@ -47,60 +47,51 @@ PAPER: dict[tuple[int, int], dict[str, dict[str, float]]] = {
         },
     },
 }
-"""The figures of Lyu et al. (2018) by (vehicles, obstacles), table and metric; (3, 1) stands in both tables, differently."""
-
-_RATES = ("obstacle_violation_rate", "neighbor_violation_rate", "connectivity", "success_rate")
-
-
-SHORT_COLUMNS = {
-    "tracking_error": ("tracking", "{:.3f}"),
-    "neighbor_violation_rate": ("too close", "{:.2%}"),
-    "obstacle_violation_rate": ("obstacle", "{:.2%}"),
-    "connectivity": ("connected", "{:.1%}"),
-}
-"""The metrics of a narrow table: heading and format."""
+"""The figures of Lyu et al. (2018) by (vehicles, obstacles), table and metric; (3, 1) is in both tables, with different figures."""
 
 
 def plain_table() -> Table:
-    """An empty table in the style of all of ours."""
+    """An empty table in the package's style."""
     return Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
 
 
 def add_short_columns(table: Table) -> None:
-    """Columns for :data:`SHORT_COLUMNS`."""
-    for heading, _ in SHORT_COLUMNS.values():
-        table.add_column(heading, justify="right", no_wrap=True)
+    """Add the columns of narrow tables, those of :func:`~sb3_flock.evaluation.metrics.columns`."""
+    for metric in columns().values():
+        table.add_column(metric.column, justify="right", no_wrap=True)
 
 
 def short_cells(means: Mapping[str, float | None], missing: str = "-") -> list[str]:
-    """What stands in them: each metric's mean, or ``missing`` where there is none (``None``, NaN)."""
-    values = [(means.get(name), pattern) for name, (_, pattern) in SHORT_COLUMNS.items()]
-    return [missing if value is None or np.isnan(value) else pattern.format(value) for value, pattern in values]
+    """The cells of these columns: each metric's mean, or ``missing`` where there is none (``None``, NaN)."""
+    values = [(means.get(name), metric) for name, metric in columns().items()]
+    return [missing if value is None or np.isnan(value) else metric.format(value) for value, metric in values]
+
+
+def short_summary(means: Mapping[str, float | None]) -> str:
+    """These columns as one line, such as ``tracking 0.087, connected 99.20%``."""
+    headings = [metric.column for metric in columns().values()]
+    return ", ".join(f"{heading} {cell}" for heading, cell in zip(headings, short_cells(means), strict=True))
 
 
 def metrics_table(metrics: dict[str, Metric], scenario: Scenario) -> Table:
-    """All metrics with their intervals, beside the paper's figures where it has some for as many vehicles and obstacles."""
+    """All metrics with their intervals, beside the paper's figures for the same numbers of vehicles and obstacles, if it has any."""
     paper = PAPER.get((scenario.n_vehicles, scenario.n_obstacles), {})
     table = plain_table()
     table.add_column("metric", no_wrap=True)
     for heading in ("mean", "95 % interval", "worst", *(f"paper {name.removeprefix('Table ')}" for name in paper)):
         table.add_column(heading, justify="right", no_wrap=True)
-    for name in METRICS:
+    for name, kind in METRICS.items():
         metric = metrics[name]
-        cells = [_number(name, metric.mean)]
-        cells.append(f"{_number(name, metric.low).rstrip('%')} .. {_number(name, metric.high)}" if metric.n else "")
-        cells.append(_number(name, metric.worst) if name in MINIMA and metric.n else "")
-        cells += [_number(name, row[name]) if name in row else "" for row in paper.values()]
+        cells = [_cell(kind, metric.mean)]
+        cells.append(f"{_cell(kind, metric.low).rstrip('%')} .. {_cell(kind, metric.high)}" if metric.n else "")
+        cells.append(_cell(kind, metric.worst) if kind.is_minimum and metric.n else "")
+        cells += [_cell(kind, row[name]) if name in row else "" for row in paper.values()]
         table.add_row(name.replace("encounter_min_separation", "encounter_min_sep"), *cells)
     return table
 
 
-def _number(name: str, value: float | None) -> str:
-    if value is None:
-        return "-"
-    if name in _RATES:
-        return f"{100 * value:.2f}%"
-    return f"{value:.1f}" if name == "return" else f"{value:.3f}"
+def _cell(metric: type[EpisodeMetric], value: float | None) -> str:
+    return "-" if value is None else metric.format(value)
 
 
 def write_json(path: str | Path, metrics: dict[str, Metric], meta: dict[str, Any]) -> None:
@@ -110,6 +101,6 @@ def write_json(path: str | Path, metrics: dict[str, Metric], meta: dict[str, Any
     """
     plain = {name: asdict(metric) for name, metric in metrics.items()}
     for name, values in plain.items():
-        if name not in MINIMA:
+        if not METRICS[name].is_minimum:
             del values["worst"]
     Path(path).write_text(json.dumps({"meta": meta, "metrics": plain}, indent=2) + "\n", encoding="utf-8")

@@ -1,4 +1,4 @@
-"""How a policy's metrics fall as its sensors err: noise, missed detections and delay, each alone."""
+"""A policy's metrics under sensor errors: noise, missed detections and delay, each alone."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ from typing import Any
 
 from rich.table import Table
 
-from sb3_flock.evaluation.episodes import evaluate
 from sb3_flock.evaluation.metrics import Metric
 from sb3_flock.evaluation.report import add_short_columns, plain_table, short_cells
+from sb3_flock.evaluation.rollout import evaluate
 from sb3_flock.sim import Scenario
 from sb3_flock.sim.sensors import SensorErrors
 
 
 def sensor_errors(scenario: Scenario) -> dict[str, SensorErrors]:
-    """Errors by their name, from none to large: noise in parts of the link range, delay in steps."""
+    """Sensor errors by name, from none to large: noise in fractions of the link range, delay in steps."""
     noise = [round(scenario.link_range * share, 12) for share in (1 / 30, 1 / 15, 2 / 15, 4 / 15)]
     delays = [round(scenario.time_step * steps, 12) for steps in (1, 2, 4, 8)]
     return {
@@ -32,12 +32,12 @@ def evaluate_with_errors(policy: Any, scenario: Scenario, episodes: int, seed: i
 
 
 def cells(row: dict[str, Metric]) -> list[str]:
-    """One row's numbers as they are shown."""
+    """One row's numbers as table cells."""
     return short_cells({name: metric.mean for name, metric in row.items()})
 
 
 def errors_table(rows: dict[str, dict[str, Metric]]) -> Table:
-    """The metrics under each error, a line each."""
+    """The metrics under each error, one row each."""
     table = plain_table()
     table.add_column("sensor errors", no_wrap=True)
     add_short_columns(table)

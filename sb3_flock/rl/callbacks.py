@@ -1,4 +1,4 @@
-"""SB3 callbacks: the neighbor-inclusive reward, the flock's metrics in the log, exploration that fades."""
+"""SB3 callbacks: the neighbor-inclusive reward, the flock's metrics in the log, noise decay, and a stop on divergence."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNoise
 
-from sb3_flock.settings import SettingsError
+from sb3_flock._compat import progress_remaining, set_noise_std
+from sb3_flock.settings import RunError, SettingsError
 from sb3_flock.sim import mix_rewards
 
 
@@ -21,16 +22,15 @@ class NeighborInclusiveReward(BaseCallback):
     contract: ``info["neighbors"]`` holds the indices into ``possible_agents`` of the agent's own copy of the env. An info
     without that key means no neighbors, and the agent keeps its own reward.
 
-    SB3 calls it after the env's step and before the transition is stored, and the rewards are rewritten in place: the
-    replay buffer takes the mixed ones. The raw reward stays where it was, in ``rollout/ep_rew_mean`` and in each info's
-    ``reward`` key (put there by this callback); the mixed one is logged as ``rollout/ep_mixed_rew_mean``. Both are means over
-    the last 100 episodes.
+    SB3 calls it after the env's step and before the transition is stored. The callback rewrites the rewards in place, so that
+    the replay buffer stores the mixed ones. The raw reward stays in ``rollout/ep_rew_mean``, and the callback copies it to each
+    info's ``reward`` key; the mixed one is logged as ``rollout/ep_mixed_rew_mean``. Both are means over the last 100 episodes.
 
     :param lambda_: share of a vehicle's own reward, in [0, 1]
     :param n_agents: agents in one copy of the env; needed only on vector envs that :func:`sb3_flock.flatten` did not make
     :param verbose: SB3's verbosity
     :raises SettingsError: for a share outside [0, 1]; at the start of the training, if the agents cannot be counted or the
-        env is wrapped in ``VecNormalize``, which would store its own rewards and throw the mixed ones away
+        env is wrapped in ``VecNormalize``, which would replace the mixed rewards by its own
     """
 
     def __init__(self, lambda_: float = 0.7, n_agents: int | None = None, verbose: int = 0) -> None:
@@ -46,7 +46,7 @@ class NeighborInclusiveReward(BaseCallback):
     def _init_callback(self) -> None:
         if self.model.get_vec_normalize_env() is not None:
             raise SettingsError(
-                "VecNormalize is not accepted: the replay buffer would take its rewards and not the neighbor-inclusive ones"
+                "VecNormalize is not accepted: the replay buffer would store its rewards and not the neighbor-inclusive ones"
             )
         n_envs = self.training_env.num_envs
         counted = getattr(self.training_env, "n_agents", None)
@@ -73,11 +73,11 @@ class NeighborInclusiveReward(BaseCallback):
         return True
 
     def state_dict(self) -> dict[str, Any]:
-        """The returns of the episodes under way and of the last ones."""
+        """The returns of the current episodes and of the last finished ones."""
         return {"returns": self._returns, "finished": list(self._finished)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from :meth:`state_dict`."""
+        """Restore :meth:`state_dict`."""
         self._returns[:] = state["returns"]
         self._finished.extend(state["finished"])
 
@@ -89,22 +89,25 @@ class NeighborInclusiveReward(BaseCallback):
         return mix_rewards(rewards, observers, first + np.concatenate(neighbors), self.lambda_)
 
 
-class DemonstratedActions(BaseCallback):
-    """Stores the actions that a teacher flew, in place of those that the policy gave and nobody flew.
+class StoreExecutedActions(BaseCallback):
+    """Stores the actions that the env executed, where an expert drove, in place of the policy's, which were not executed.
 
-    They stand in the infos of a :class:`~sb3_flock.envs.demonstrations.DemonstratedEnv`. The returns that SB3 logs, and the
-    mixed ones, are of all episodes, the teacher's included.
+    The infos of an :class:`~sb3_flock.envs.expert_env.ExpertEnv` hold them as ``executed_action``. The logged returns, raw and
+    mixed, are of all episodes, the expert's included.
     """
 
     def _on_step(self) -> bool:
         for slot, info in enumerate(self.locals["infos"]):
-            if "action" in info:
-                self.locals["buffer_actions"][slot] = self.model.policy.scale_action(info["action"])
+            if info.get("expert_drives"):
+                self.locals["buffer_actions"][slot] = self.model.policy.scale_action(info["executed_action"])
         return True
 
 
 class FlockMetrics(BaseCallback):
-    """Logs the infos' ``metrics`` and ``reward_terms`` as ``flock/...``: means since an episode last ended, but a teacher's."""
+    """Logs the infos' ``metrics`` and ``reward_terms`` as ``flock/...``: means over the steps since an episode last ended.
+
+    Steps that an expert drove are left out.
+    """
 
     def __init__(self, verbose: int = 0) -> None:
         super().__init__(verbose)
@@ -113,7 +116,7 @@ class FlockMetrics(BaseCallback):
 
     def _on_step(self) -> bool:
         for info in self.locals["infos"]:
-            if "action" in info:
+            if info.get("expert_drives"):
                 continue
             for name, value in {**info.get("metrics", {}), **info.get("reward_terms", {})}.items():
                 if np.isfinite(value):
@@ -131,13 +134,13 @@ class FlockMetrics(BaseCallback):
         return {"sums": dict(self._sums), "count": self._count}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from :meth:`state_dict`."""
+        """Restore :meth:`state_dict`."""
         self._sums.update(state["sums"])
         self._count = state["count"]
 
 
-class FadingNoise(BaseCallback):
-    """Lets Gaussian exploration noise fade linearly over the training.
+class LinearNoiseDecay(BaseCallback):
+    """Changes the standard deviation of Gaussian action noise linearly over the training.
 
     :param start: standard deviation at the start, in units of the normalized action
     :param end: standard deviation at the end
@@ -152,8 +155,30 @@ class FadingNoise(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         noise = self.model.action_noise
-        sigma = self.end + (self.start - self.end) * self.model._current_progress_remaining
+        sigma = self.end + (self.start - self.end) * progress_remaining(self.model)
         for part in noise.noises if isinstance(noise, VectorizedActionNoise) else [noise]:
             if isinstance(part, NormalActionNoise):
-                part._sigma = np.full_like(part._sigma, sigma)
-        self.logger.record("train/noise", sigma)
+                set_noise_std(part, sigma)
+        self.logger.record("train/action_noise_std", sigma)
+
+
+class DivergedError(RunError):
+    """A loss is no longer finite. A training resumed from the last checkpoint would diverge again."""
+
+
+class StopOnNonFiniteLoss(BaseCallback):
+    """Stops a training whose losses are no longer finite, before anything of it is saved.
+
+    :raises DivergedError: one line that names the loss
+    """
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_start(self) -> None:
+        for name, value in self.logger.name_to_value.items():
+            if name.startswith("train/") and name.endswith("loss") and not np.isfinite(value):
+                raise DivergedError(
+                    f"{name} = {value} after {self.num_timesteps} transitions: the training diverged; a smaller "
+                    "learning_rate or reward scale may help"
+                )

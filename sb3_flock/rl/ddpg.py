@@ -1,4 +1,4 @@
-"""FlockDDPG: SB3's DDPG with a lean update."""
+"""FlockDDPG: SB3's DDPG with a faster update and an optional behavior cloning term."""
 
 from __future__ import annotations
 
@@ -10,27 +10,33 @@ from stable_baselines3 import DDPG
 from torch.nn import functional as F  # noqa: N812 - torch's name for it
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
-from sb3_flock.rl.extractor import FlockCNN
+from sb3_flock._renamed import FIELDS
+from sb3_flock.rl.torch_layers import FlockCNN
 from sb3_flock.settings import SettingsError
 
 
 class FlockDDPG(DDPG):
-    """DDPG whose :meth:`train` does what SB3's does, equal to rounding, in about half the time on a CPU; with guidance, more.
+    """DDPG whose :meth:`train` equals SB3's up to rounding, in about half the time on a CPU (Algorithm 1 of the paper).
 
-    The patches of a minibatch are gathered once for all networks that see it; the actor's step takes no gradient of the
-    critic's weights, which nobody would use; the target networks follow in one operation; losses are read once a round.
+    The patches of a minibatch are gathered once for all networks with that input; the actor's step computes no gradient of
+    the critic's weights, which no optimizer would use; the target networks are updated in one operation; losses are read
+    once a round.
 
-    :param guidance: weight of the mean absolute difference to the advised actions, each from -1 to 1, in the actor's loss; if
-        it is not 0, the replay buffer must be a :class:`CompactReplayBuffer` with advice
+    :param bc_coef: weight of the behavior cloning term in the actor's loss: the mean absolute difference to the expert's
+        actions, each scaled to [-1, 1] (as in TD3+BC, with the absolute difference); if it is not 0, the replay buffer must
+        be a :class:`CompactReplayBuffer` with ``store_expert_actions``
 
     The other parameters are those of SB3's ``DDPG``. Every features extractor must be a :class:`FlockCNN`.
     """
 
-    def __init__(self, *args: Any, guidance: float = 0.0, **kwargs: Any) -> None:
-        self.guidance = guidance
+    def __init__(self, *args: Any, bc_coef: float = 0.0, **kwargs: Any) -> None:
+        self.bc_coef = bc_coef
         super().__init__(*args, **kwargs)
 
     def _setup_model(self) -> None:
+        for old, new in FIELDS["FlockDDPG"].items():  # attributes of a file from the previous release
+            if old in vars(self):
+                setattr(self, new, vars(self).pop(old))
         super()._setup_model()
         for network in (self.actor, self.critic):
             extractor = network.features_extractor
@@ -39,8 +45,10 @@ class FlockDDPG(DDPG):
                     f"features_extractor_class = {type(extractor).__name__}: FlockDDPG needs FlockCNN; SB3's DDPG takes any"
                 )
 
-        if self.guidance and getattr(self.replay_buffer, "advice", None) is None:
-            raise SettingsError(f"guidance = {self.guidance}: needs a CompactReplayBuffer with advice=True, or be 0")
+        if self.bc_coef and getattr(self.replay_buffer, "expert_actions", None) is None:
+            raise SettingsError(
+                f"bc_coef = {self.bc_coef}: a CompactReplayBuffer with store_expert_actions=True is needed, or bc_coef 0"
+            )
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
         """Update the networks from the replay buffer (Algorithm 1 of the paper; one target network each)."""
@@ -50,7 +58,7 @@ class FlockDDPG(DDPG):
         actor, critic = list(self.actor.parameters()), list(self.critic.parameters())
         targets = list(self.actor_target.parameters()) + list(self.critic_target.parameters())
         follow = get_ema_multi_avg_fn(1.0 - self.tau)  # type: ignore[no-untyped-call]
-        actor_losses, critic_losses, gaps = [], [], []
+        actor_losses, critic_losses, bc_losses = [], [], []
         for _ in range(gradient_steps):
             self._n_updates += 1
             batch = self.replay_buffer.sample(batch_size)  # type: ignore[union-attr]
@@ -68,10 +76,10 @@ class FlockDDPG(DDPG):
 
             actions = self.actor(observations)
             actor_loss = -self.critic.q1_forward(observations, actions).mean()
-            if self.guidance:
-                gap = F.l1_loss(actions, batch.advice)  # type: ignore[union-attr]
-                actor_loss = actor_loss + self.guidance * gap
-                gaps.append(gap.detach())
+            if self.bc_coef:
+                bc_loss = F.l1_loss(actions, batch.expert_actions)  # type: ignore[union-attr]
+                actor_loss = actor_loss + self.bc_coef * bc_loss
+                bc_losses.append(bc_loss.detach())
             _step(self.actor.optimizer, actor_loss, actor)
 
             follow(targets, actor + critic, None)
@@ -81,8 +89,8 @@ class FlockDDPG(DDPG):
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self.logger.record("train/actor_loss", np.mean(th.stack(actor_losses).tolist()))
         self.logger.record("train/critic_loss", np.mean(th.stack(critic_losses).tolist()))
-        if gaps:
-            self.logger.record("train/advice_gap", np.mean(th.stack(gaps).tolist()))
+        if bc_losses:
+            self.logger.record("train/bc_loss", np.mean(th.stack(bc_losses).tolist()))
 
 
 def _step(optimizer: th.optim.Optimizer, loss: th.Tensor, parameters: list[th.nn.Parameter]) -> None:

@@ -1,12 +1,13 @@
-"""The task itself: vehicles, obstacles, waypoint, what a vehicle senses and what it is paid for. NumPy; numba where installed."""
+"""The task: vehicles, obstacles and waypoint, what a vehicle senses, observes and is rewarded for. NumPy, numba if installed."""
 
-from sb3_flock.sim.observation import observe
-from sb3_flock.sim.reward import RewardWeights, mix_rewards, own_reward, reward_terms
+from sb3_flock.sim.observation import Channel, observe, register_channel
+from sb3_flock.sim.reward import RewardWeights, mix_rewards, own_reward, register_reward_term, reward_terms
 from sb3_flock.sim.scenario import Scenario
-from sb3_flock.sim.sensing import Contacts, Sensing, sense
+from sb3_flock.sim.sensing import Contacts, Sensing
 from sb3_flock.sim.world import World, episode_rng
 
 __all__ = [
+    "Channel",
     "Contacts",
     "RewardWeights",
     "Scenario",
@@ -16,6 +17,7 @@ __all__ = [
     "mix_rewards",
     "observe",
     "own_reward",
+    "register_channel",
+    "register_reward_term",
     "reward_terms",
-    "sense",
 ]

@@ -1,4 +1,4 @@
-"""Whether the compiled inner loops are at hand."""
+"""Access to the numba kernels where numba is installed."""
 
 from __future__ import annotations
 
@@ -12,5 +12,5 @@ def compiled() -> ModuleType | None:
     """:mod:`sb3_flock.sim.kernels`, or ``None`` where numba (the ``fast`` extra) is not installed."""
     try:
         return importlib.import_module("sb3_flock.sim.kernels")
-    except (ImportError, RuntimeError):  # RuntimeError: there is no folder where numba may keep what it compiled
+    except (ImportError, RuntimeError):  # RuntimeError: there is no folder where numba may keep its cache
         return None

@@ -1,4 +1,4 @@
-"""The inner loops of the world compiled by numba. What they compute is told and tested where they are called."""
+"""The inner loops of the world, compiled by numba: twins of the functions named in their docstrings, tested against them."""
 
 from __future__ import annotations
 
@@ -11,10 +11,8 @@ from numba import njit
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from sb3_flock.sim.sensing import Pairs
-
 _CHUNK = 64
-"""Bodies whose factors are computed side by side."""
+"""Bodies whose factors are computed together."""
 
 _SERIES = tuple(1 / math.factorial(k) for k in range(9, -1, -1))
 """Coefficients of the exponential's series."""
@@ -22,8 +20,12 @@ _SERIES = tuple(1 / math.factorial(k) for k in range(9, -1, -1))
 
 @njit(cache=True)
 def find_contacts(
-    positions: NDArray[np.float64], frames: NDArray[np.float64], bodies: NDArray[np.float64], reach: float, others: bool
-) -> Pairs:
+    positions: NDArray[np.float64],
+    frames: NDArray[np.float64],
+    bodies: NDArray[np.float64],
+    sensing_range: float,
+    exclude_self: bool,
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
     """:func:`sb3_flock.sim.sensing.find_contacts` by comparing all pairs of a flock."""
     n_flocks, n_vehicles, _ = positions.shape
     n_bodies = bodies.shape[1]
@@ -35,12 +37,12 @@ def find_contacts(
         for i in range(n_vehicles):
             cos, sin = frames[flock, i, 0], frames[flock, i, 1]
             for j in range(n_bodies):
-                if others and i == j:
+                if exclude_self and i == j:
                     continue
                 x = bodies[flock, j, 0] - positions[flock, i, 0]
                 y = bodies[flock, j, 1] - positions[flock, i, 1]
                 distance = math.sqrt(x * x + y * y)
-                if distance < reach:
+                if distance < sensing_range:
                     observers[n], found[n], distances[n] = flock * n_vehicles + i, j, distance
                     relative[n, 0], relative[n, 1] = cos * x + sin * y, cos * y - sin * x
                     n += 1
@@ -48,8 +50,8 @@ def find_contacts(
 
 
 @njit(error_model="numpy", cache=True)
-def paint(
-    tensor: NDArray[np.float32],
+def rasterize(
+    channels: NDArray[np.float32],
     channel: int,
     observers: NDArray[np.int64],
     positions: NDArray[np.float64],
@@ -57,9 +59,9 @@ def paint(
     sigma: float,
     row: tuple[int, ...],
 ) -> None:
-    """:func:`sb3_flock.sim.observation.paint`, some bodies at a time.
+    """:func:`sb3_flock.sim.observation.rasterize`, some bodies at a time.
 
-    :param row: as many numbers as a row has anchors: a tuple's length is known to the compiler, which then unrolls the loops
+    :param row: as many numbers as a row has anchors: numba knows a tuple's length at compile time and unrolls the loops
     """
     side = len(row)
     spacing = 2 * radius / (side - 1)
@@ -67,18 +69,18 @@ def paint(
     along_x, along_y = np.empty((side, _CHUNK), np.float32), np.empty((side, _CHUNK), np.float32)
     x, y = np.zeros(_CHUNK), np.zeros(_CHUNK)
     factors = np.empty(side, np.float32)
-    beyond = 40.0 / step  # anchor spacings from the edge; a body farther out shows nowhere
+    margin = 40.0 / step  # anchor spacings from the edge; a body farther out adds 0 everywhere
     last = -1
     for start in range(0, len(observers), _CHUNK):
         count = min(_CHUNK, len(observers) - start)
         for i in range(count):
-            x[i] = min(max((positions[start + i, 0] + radius) / spacing, -beyond), side - 1 + beyond)
-            y[i] = min(max((positions[start + i, 1] + radius) / spacing, -beyond), side - 1 + beyond)
+            x[i] = min(max((positions[start + i, 0] + radius) / spacing, -margin), side - 1 + margin)
+            y[i] = min(max((positions[start + i, 1] + radius) / spacing, -margin), side - 1 + margin)
         _gaussians(along_x, x, step, row)
         _gaussians(along_y, y, step, row)
         for i in range(count):
             observer = observers[start + i]
-            plane = tensor[observer, channel]
+            plane = channels[observer, channel]
             for b in range(side):
                 factors[b] = along_y[b, i]
             if observer == last:
@@ -88,14 +90,14 @@ def paint(
                         plane[a, b] += factor * factors[b]
             else:
                 for blank in range(last + 1, observer):
-                    tensor[blank, channel] = 0
+                    channels[blank, channel] = 0
                 for a in range(side):
                     factor = along_x[a, i]
                     for b in range(side):
                         plane[a, b] = factor * factors[b]
                 last = observer
-    for blank in range(last + 1, len(tensor)):
-        tensor[blank, channel] = 0
+    for blank in range(last + 1, len(channels)):
+        channels[blank, channel] = 0
 
 
 @njit(error_model="numpy", cache=True)
@@ -122,9 +124,9 @@ def _gaussians(out: NDArray[np.float32], x: NDArray[np.float64], step: float, ro
 
 @njit(error_model="numpy", inline="always")
 def _exp(t: float) -> float:
-    """exp(t): that of t / 1024 by its series, squared ten times. The compiler does several at once, unlike the library's.
+    """exp(t): that of t / 1024 by its series, squared ten times. Unlike the library's, this one is vectorized by the compiler.
 
-    Relative error: 1e-13 up to 100 either way, 1e-9 at 300, 3e-7 at -500, where all is 0 in single precision.
+    Relative error: 1e-13 up to 100 either way, 1e-9 at 300, 3e-7 at -500, where the result is 0 in single precision.
     """
     u = t / 1024
     power = 0.0

@@ -1,63 +1,108 @@
-"""The reward of section IV-B: four terms by name, their sum, and the neighbor-inclusive mix."""
+"""The reward of section IV-B: named terms, their sum, and the neighbor-inclusive mix.
+
+A further term is a function registered with :func:`register_reward_term`; ``RewardWeights(extra_terms={"name": weight})``
+switches it on.
+"""
 
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, field_validator
 
-from sb3_flock.settings import NotNegative, Positive, Settings
+from sb3_flock.settings import NotNegative, Positive, Settings, suggest
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from sb3_flock.sim.scenario import Scenario
-    from sb3_flock.sim.sensing import Sensing
+    from sb3_flock.sim.sensing import Sensing, SensingSettings
+
+    RewardTerm = Callable[[Sensing, NDArray[np.float64], SensingSettings], NDArray[np.float64]]
+
+EXTRA_TERMS: dict[str, RewardTerm] = {}
+"""Registered further terms by name."""
+
+_OWN_TERMS = ("connectivity", "obstacle", "waypoint", "control")
+
+
+def register_reward_term(name: str) -> Callable[[RewardTerm], RewardTerm]:
+    """Register a further reward term under a name, as a decorator.
+
+    The function gets what every vehicle senses after the step, the clipped actions ``(flocks, vehicles, 2)`` [m/s, rad/s] and
+    the sensing ranges. It returns the unweighted term, ``(flocks, vehicles)``.
+
+    :raises ValueError: if a term has the name already
+    """
+
+    def register(term: RewardTerm) -> RewardTerm:
+        if name in _OWN_TERMS or EXTRA_TERMS.setdefault(name, term) is not term:
+            raise ValueError(f"reward term {name!r} is registered already")
+        return term
+
+    return register
 
 
 class RewardWeights(Settings):
-    """The weights of the reward. Those the paper does not name are 1, its plain sum, in ``configs/paper_plain.yaml``."""
+    """The weights of the reward. The paper's plain sum is in ``configs/paper_plain.yaml``: weights of 1."""
 
-    link_bonus: NotNegative = Field(0.5, description="reward for each neighbor at a safe distance (paper, IV-B: 1)")
+    link_bonus: NotNegative = Field(0.5, description="reward for each neighbor at a safe distance (paper: 1)")
     separation_penalty: NotNegative = Field(
-        6.0, description="penalty for each neighbor nearer than neighbor_separation (paper, IV-B: 1)"
+        6.0, description="penalty for each neighbor nearer than neighbor_separation (paper: 1)"
     )
     obstacle_penalty: NotNegative = Field(
-        12.0, description="penalty for each obstacle nearer than obstacle_separation (paper, IV-B: 1)"
+        12.0, description="penalty for each obstacle nearer than obstacle_separation (paper: 1)"
     )
-    epsilon: NotNegative = Field(10.0, description="weight of the distance to the waypoint [1/m] (paper leaves it open)")
+    epsilon: NotNegative = Field(10.0, description="weight of the distance to the waypoint [1/m] (paper: not stated)")
     max_distance: Positive | None = Field(
-        None, description="distance to the waypoint beyond which it costs no more [m]; null: none (ours; paper: none)"
+        None, description="distance to the waypoint at which its penalty saturates [m]; null: never (paper: null)"
     )
     beta: float = Field(
-        -0.02, ge=-1e6, le=0, description="weight of the squared action [m/s, rad/s], not positive (paper leaves it open)"
+        -0.02, ge=-1e6, le=0, description="weight of the squared action [m/s, rad/s], not positive (paper: not stated)"
     )
     lambda_: float = Field(
-        0.7, ge=0, le=1, description="share of a vehicle's own reward in the mix with its neighbors' (open)"
+        0.7, ge=0, le=1, description="share of a vehicle's own reward in the mix with its neighbors' (paper: not stated)"
     )
-    scale: Positive = Field(0.02, description="factor on the sum of the four terms (ours; paper: 1)")
+    scale: Positive = Field(0.02, description="factor on the sum of the terms (paper: 1)")
+    extra_terms: dict[str, float] = Field({}, description="weights of further registered terms by name (paper: none)")
+
+    @field_validator("extra_terms")
+    @classmethod
+    def _are_registered(cls, weights: dict[str, float]) -> dict[str, float]:
+        for name in weights:
+            if name not in EXTRA_TERMS:
+                known = f"registered are {', '.join(EXTRA_TERMS)}" if EXTRA_TERMS else "none is registered"
+                raise ValueError(
+                    f"extra_terms = {name}: a term registered with register_reward_term is needed; "
+                    f"{known}{suggest(name, EXTRA_TERMS)}"
+                )
+        return weights
 
 
-def reward_terms(sensing: Sensing, actions: NDArray[np.float64], scenario: Scenario) -> dict[str, NDArray[np.float64]]:
-    """The four terms of r_i, weighted and scaled, so that their sum is r_i.
+def reward_terms(
+    sensing: Sensing, actions: NDArray[np.float64], weights: RewardWeights, ranges: SensingSettings
+) -> dict[str, NDArray[np.float64]]:
+    """The terms of r_i, weighted and scaled, so that their sum is r_i (section IV-B).
 
     :param sensing: what every vehicle senses after the step
-    :param actions: ``(flocks, vehicles, 2)`` [m/s, rad/s], the clipped actions that led there
-    :param scenario: ranges and weights
-    :return: ``connectivity``, ``obstacle``, ``waypoint`` and ``control``, each ``(flocks, vehicles)``
+    :param actions: ``(flocks, vehicles, 2)`` [m/s, rad/s], the clipped actions of the step
+    :param weights: the weights
+    :param ranges: the sensing ranges and minimum separations
+    :return: ``connectivity``, ``obstacle``, ``waypoint``, ``control`` and the extra terms, each ``(flocks, vehicles)``
     """
-    weights = scenario.reward
     distances = np.minimum(sensing.waypoint_distances, np.inf if weights.max_distance is None else weights.max_distance)
-    too_close = sensing.neighbors.count(scenario.neighbor_separation)
-    linked = sensing.neighbors.count() - too_close
+    violations = sensing.neighbors.count(ranges.neighbor_separation)
+    linked = sensing.neighbors.count() - violations
     terms = {
-        "connectivity": weights.link_bonus * linked - weights.separation_penalty * too_close,
-        "obstacle": -weights.obstacle_penalty * sensing.obstacles.count(scenario.obstacle_separation),
+        "connectivity": weights.link_bonus * linked - weights.separation_penalty * violations,
+        "obstacle": -weights.obstacle_penalty * sensing.obstacles.count(ranges.obstacle_separation),
         "waypoint": -weights.epsilon * distances,
         "control": weights.beta * (np.square(actions[..., 0]) + np.square(actions[..., 1])),
     }
+    for name, weight in weights.extra_terms.items():
+        terms[name] = weight * EXTRA_TERMS[name](sensing, actions, ranges)
     return {name: weights.scale * term for name, term in terms.items()}
 
 
@@ -71,7 +116,7 @@ def mix_rewards(
 ) -> NDArray[np.float64]:
     """The neighbor-inclusive reward r_{i} = lambda r_i + (1 - lambda) mean of the neighbors' r_j (section IV-B).
 
-    A vehicle without neighbors keeps its own r_i, unscaled: scaling it would pay (or fine) it for being alone.
+    A vehicle without neighbors keeps its own r_i, unscaled: a scaled one would reward or punish the vehicle for being alone.
 
     :param rewards: r of all vehicles, of any shape
     :param observers: ``(links,)``, number i of a vehicle in ``rewards``, flattened
@@ -81,5 +126,5 @@ def mix_rewards(
     """
     own = np.asarray(rewards, dtype=np.float64).ravel()
     count = np.bincount(observers, minlength=len(own))
-    others = np.bincount(observers, own[neighbors], minlength=len(own)) / np.maximum(count, 1)
-    return np.where(count > 0, lambda_ * own + (1 - lambda_) * others, own).reshape(np.shape(rewards))
+    mean_of_neighbors = np.bincount(observers, own[neighbors], minlength=len(own)) / np.maximum(count, 1)
+    return np.where(count > 0, lambda_ * own + (1 - lambda_) * mean_of_neighbors, own).reshape(np.shape(rewards))

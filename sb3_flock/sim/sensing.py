@@ -7,24 +7,40 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from pydantic import Field, model_validator
 
+from sb3_flock.settings import NotNegative, Positive, Settings
 from sb3_flock.sim.backend import compiled
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from sb3_flock.sim.world import World
-
 _FEW = 128
-"""Bodies up to which all pairs are compared; a cell list is faster beyond."""
+"""Largest number of bodies for which all pairs are compared; for more, a cell list is faster."""
 
 _BLOCK = 1_000_000
-"""Distances held at once where all pairs of bodies are asked for."""
+"""Largest number of distances in memory at once in :func:`distance_blocks`."""
+
+
+class SensingSettings(Settings):
+    """How far vehicles sense, and the minimum separations they have to keep."""
+
+    link_range: Positive = Field(0.15, description="proximity network threshold r_n [m] (paper: 0.15)")
+    neighbor_separation: NotNegative = Field(0.1, description="minimum separation to neighbors r_n' [m] (paper: 0.1)")
+    detection_range: Positive = Field(0.25, description="obstacle detection range r_o [m] (paper: 0.25)")
+    obstacle_separation: NotNegative = Field(0.15, description="minimum separation to obstacles r_o' [m] (paper: 0.15)")
+
+    @model_validator(mode="after")
+    def _ranges_fit(self) -> SensingSettings:
+        for near, far in (("neighbor_separation", "link_range"), ("obstacle_separation", "detection_range")):
+            if getattr(self, near) > getattr(self, far):
+                raise ValueError(f"{near} = {getattr(self, near)}: input should be at most {far} = {getattr(self, far)}")
+        return self
 
 
 @dataclass(frozen=True)
 class Contacts:
-    """Who senses whom: a row a pair, in the order of the sensing vehicles, then of the sensed bodies.
+    """Who senses whom: one row a pair, in the order of the sensing vehicles, then of the sensed bodies.
 
     Memory and time grow with the pairs in range, not with the square of the bodies.
     """
@@ -54,9 +70,9 @@ class Contacts:
         """The bodies that each vehicle senses, ascending; one array a vehicle."""
         return np.split(self.bodies, np.cumsum(self.count().ravel())[:-1])
 
-    def after(self, moved: NDArray[np.float64]) -> Contacts:
-        """The same contacts in the observers' frames after a further move ``(contacts, 2)``."""
-        positions = after(self.positions, moved)
+    def compensate_ego_motion(self, ego_motion: NDArray[np.float64]) -> Contacts:
+        """The same bodies, where they were, in the observers' frames after a further ego-motion ``(contacts, 2)``."""
+        positions = compensate_ego_motion(self.positions, ego_motion)
         return replace(self, positions=positions, distances=_norm(positions))
 
     @property
@@ -82,17 +98,18 @@ class Sensing:
     """``(flocks, vehicles, 2)``."""
     waypoint_distances: NDArray[np.float64]
     """``(flocks, vehicles)``."""
-    moved: NDArray[np.float64]
-    """``(flocks, vehicles, 2)``: own way forward [m] and, at its end, turn [rad] since the last step; 0 at the start."""
-    earlier: Sensing | None = None
-    """What was sensed ``look_back`` ago, seen from the place of now; ``None`` where vehicles do not remember."""
+    ego_motion: NDArray[np.float64]
+    """``(flocks, vehicles, 2)``: the vehicle's own motion since the last step, forward [m], then turn [rad]; 0 at the start."""
+    previous: Sensing | None = None
+    """What was sensed ``motion_lag`` ago, in the vehicles' present frames; ``None`` without motion channels."""
 
-    def after(self, moved: NDArray[np.float64]) -> Sensing:
-        """The same bodies, where they were, in the vehicles' frames after a further move."""
+    def compensate_ego_motion(self, ego_motion: NDArray[np.float64]) -> Sensing:
+        """The same bodies, where they were, in the vehicles' frames after a further ego-motion ``(flocks, vehicles, 2)``."""
         neighbors, obstacles = (
-            contacts.after(moved.reshape(-1, 2)[contacts.observers]) for contacts in (self.neighbors, self.obstacles)
+            contacts.compensate_ego_motion(ego_motion.reshape(-1, 2)[contacts.observers])
+            for contacts in (self.neighbors, self.obstacles)
         )
-        waypoints = after(self.waypoint_positions, moved)
+        waypoints = compensate_ego_motion(self.waypoint_positions, ego_motion)
         return replace(
             self,
             neighbors=neighbors,
@@ -102,26 +119,41 @@ class Sensing:
         )
 
 
-def sense(world: World, moved: NDArray[np.float64] | None = None) -> Sensing:
-    """Everything the vehicles of every flock sense in the world's present state (section III-A).
+def sense(
+    positions: NDArray[np.float64],
+    frames: NDArray[np.float64],
+    obstacle_positions: NDArray[np.float64],
+    waypoints: NDArray[np.float64],
+    ranges: SensingSettings,
+    ego_motion: NDArray[np.float64] | None = None,
+) -> Sensing:
+    """Everything the vehicles of every flock sense: the graphs G_c and G_o and the waypoint (section III-A).
 
-    :param moved: :attr:`Sensing.moved`; ``None`` at the start
+    :param positions: of the vehicles, ``(flocks, vehicles, 2)`` [m]
+    :param frames: cosine and sine of their headings, ``(flocks, vehicles, 2)``
+    :param obstacle_positions: ``(flocks, obstacles, 2)`` [m]
+    :param waypoints: ``(flocks, 2)`` [m]
+    :param ranges: how far vehicles sense
+    :param ego_motion: :attr:`Sensing.ego_motion`; ``None`` at the start
     """
-    scenario, positions = world.scenario, world.positions
-    frames = world.frames
-    offsets = world.waypoints[:, None, :] - positions
+    offsets = waypoints[:, None, :] - positions
     return Sensing(
-        neighbors=find_contacts(positions, frames, positions, scenario.link_range, others=True),
-        obstacles=find_contacts(positions, frames, world.obstacle_positions, scenario.detection_range),
+        neighbors=find_contacts(positions, frames, positions, ranges.link_range, exclude_self=True),
+        obstacles=find_contacts(positions, frames, obstacle_positions, ranges.detection_range),
         waypoint_positions=_to_body(offsets, frames),
         waypoint_distances=_norm(offsets),
-        moved=np.zeros_like(positions) if moved is None else moved,
+        ego_motion=np.zeros_like(positions) if ego_motion is None else ego_motion,
     )
 
 
-def after(positions: NDArray[np.float64], moved: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Positions in a body's frame ``(..., 2)`` [m] as they are in its frame after the body moved (:attr:`Sensing.moved`)."""
-    forward, turn = moved[..., 0], moved[..., 1]
+def compensate_ego_motion(positions: NDArray[np.float64], ego_motion: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Positions in a body's frame, transformed into its frame after the body has moved.
+
+    :param positions: ``(..., 2)`` [m], in the frame before the motion
+    :param ego_motion: ``(..., 2)``: forward [m], then turn [rad], as :attr:`Sensing.ego_motion`
+    :return: ``(..., 2)`` [m], in the frame after it
+    """
+    forward, turn = ego_motion[..., 0], ego_motion[..., 1]
     ahead = np.stack((positions[..., 0] - forward, positions[..., 1]), axis=-1)
     return _to_body(ahead, np.stack((np.cos(turn), np.sin(turn)), axis=-1))
 
@@ -130,26 +162,26 @@ def find_contacts(
     positions: NDArray[np.float64],
     frames: NDArray[np.float64],
     bodies: NDArray[np.float64],
-    reach: float,
-    others: bool = False,
-    compile_it: bool = True,
+    sensing_range: float,
+    exclude_self: bool = False,
+    use_numba: bool = True,
 ) -> Contacts:
-    """The bodies strictly nearer than ``reach`` to each vehicle of the same flock.
+    """The bodies strictly nearer than ``sensing_range`` to each vehicle of the same flock (section III-A).
 
     :param positions: of the vehicles, ``(flocks, vehicles, 2)`` [m]
     :param frames: cosine and sine of their headings, ``(flocks, vehicles, 2)``
     :param bodies: positions of the bodies, ``(flocks, bodies, 2)`` [m]
-    :param reach: range [m]
-    :param others: whether the bodies are the vehicles, of which none senses itself
-    :param compile_it: use numba where it is installed; the numbers are the same
+    :param sensing_range: range [m]
+    :param exclude_self: the bodies are the vehicles themselves, and no vehicle senses itself
+    :param use_numba: use numba where it is installed; the numbers are the same
     """
     shape = positions.shape[:2]
-    kernels = compiled() if compile_it and bodies.shape[1] <= _FEW else None
+    kernels = compiled() if use_numba and bodies.shape[1] <= _FEW else None
     if kernels is not None:
-        return Contacts(shape, *kernels.find_contacts(positions, frames, bodies, reach, others))
+        return Contacts(shape, *kernels.find_contacts(positions, frames, bodies, sensing_range, exclude_self))
     pairs = _all_pairs if bodies.shape[1] <= _FEW else _pairs_by_cell
-    observers, found, offsets, distances = pairs(positions, bodies, reach)
-    if others:
+    observers, found, offsets, distances = pairs(positions, bodies, sensing_range)
+    if exclude_self:
         apart = observers % shape[1] != found
         observers, found, offsets, distances = observers[apart], found[apart], offsets[apart], distances[apart]
     return Contacts(shape, observers, found, _to_body(offsets, frames.reshape(-1, 2)[observers]), distances)
@@ -159,10 +191,10 @@ Pairs = tuple["NDArray[np.int64]", "NDArray[np.int64]", "NDArray[np.float64]", "
 """Observers, bodies, offsets in the world's frame and distances of the pairs in range."""
 
 
-def _all_pairs(positions: NDArray[np.float64], bodies: NDArray[np.float64], reach: float) -> Pairs:
+def _all_pairs(positions: NDArray[np.float64], bodies: NDArray[np.float64], sensing_range: float) -> Pairs:
     offsets = bodies[:, None, :, :] - positions[:, :, None, :]
     distances = _norm(offsets)
-    flocks, vehicles, found = np.nonzero(distances < reach)
+    flocks, vehicles, found = np.nonzero(distances < sensing_range)
     return (
         flocks * positions.shape[1] + vehicles,
         found,
@@ -171,16 +203,16 @@ def _all_pairs(positions: NDArray[np.float64], bodies: NDArray[np.float64], reac
     )
 
 
-def _pairs_by_cell(positions: NDArray[np.float64], bodies: NDArray[np.float64], reach: float) -> Pairs:
-    """Square cells of side ``reach``, numbered flock by flock and column by column: a body in range of a vehicle lies in one
+def _pairs_by_cell(positions: NDArray[np.float64], bodies: NDArray[np.float64], sensing_range: float) -> Pairs:
+    """Square cells of side ``sensing_range``, numbered flock by flock and column by column: a body in range of a vehicle lies in one
     of three columns, in three cells of consecutive numbers each, so sorted bodies are found by bisection."""
     n_flocks, n_bodies, _ = bodies.shape
     corner = np.minimum(positions.min((0, 1)), bodies.min((0, 1), initial=np.inf))
     span = np.maximum(positions.max((0, 1)), bodies.max((0, 1), initial=-np.inf)) - corner
-    columns, rows = (span // reach).astype(np.int64) + 3  # an empty one on either side
+    columns, rows = (span // sensing_range).astype(np.int64) + 3  # an empty one on either side
 
     def cells(points: NDArray[np.float64]) -> NDArray[np.int64]:
-        column, row = np.moveaxis(((points - corner) // reach).astype(np.int64) + 1, -1, 0)
+        column, row = np.moveaxis(((points - corner) // sensing_range).astype(np.int64) + 1, -1, 0)
         return ((np.arange(n_flocks)[:, None] * columns + column) * rows + row).ravel()
 
     body_cells = cells(bodies)
@@ -193,17 +225,17 @@ def _pairs_by_cell(positions: NDArray[np.float64], bodies: NDArray[np.float64], 
 
     offsets = bodies.reshape(-1, 2)[candidates] - positions.reshape(-1, 2)[observers]
     distances = _norm(offsets)
-    near = np.flatnonzero(distances < reach)
+    near = np.flatnonzero(distances < sensing_range)
     near = near[np.lexsort((candidates[near], observers[near]))]
     return observers[near], candidates[near] % n_bodies, offsets[near], distances[near]
 
 
 def distance_blocks(
-    positions: NDArray[np.float64], bodies: NDArray[np.float64], others: bool = False
+    positions: NDArray[np.float64], bodies: NDArray[np.float64], exclude_self: bool = False
 ) -> Iterator[tuple[slice, NDArray[np.float64]]]:
     """Distances between all vehicles and bodies of a flock, in range or not, some vehicles at a time to bound the memory.
 
-    :param others: whether the bodies are the vehicles; the distance to itself is infinite then
+    :param exclude_self: the bodies are the vehicles themselves; the distance of a vehicle to itself is then infinite
     :return: a slice of the vehicles and ``(flocks, those vehicles, bodies)`` [m]
     """
     flocks, vehicles, _ = positions.shape
@@ -211,25 +243,25 @@ def distance_blocks(
     for start in range(0, vehicles, step):
         rows = slice(start, min(start + step, vehicles))
         distances = _norm(bodies[:, None, :, :] - positions[:, rows, None, :])
-        if others:
+        if exclude_self:
             own = np.arange(rows.start, rows.stop)
             distances[:, own - start, own] = np.inf
         yield rows, distances
 
 
-def nearest(positions: NDArray[np.float64], bodies: NDArray[np.float64], others: bool = False) -> NDArray[np.float64]:
+def nearest(positions: NDArray[np.float64], bodies: NDArray[np.float64], exclude_self: bool = False) -> NDArray[np.float64]:
     """Each vehicle's distance to the nearest body, in range or not: ``(flocks, vehicles)`` [m], inf where there is none."""
     found = np.empty(positions.shape[:2])
-    for rows, distances in distance_blocks(positions, bodies, others):
+    for rows, distances in distance_blocks(positions, bodies, exclude_self):
         found[:, rows] = distances.min(-1, initial=np.inf)
     return found
 
 
 def is_connected(neighbors: Contacts) -> NDArray[np.bool_]:
-    """Whether each flock's proximity graph is connected, ``(flocks,)``; one vehicle alone is."""
+    """Whether each flock's proximity graph is connected, ``(flocks,)``; the graph of a single vehicle is."""
     flocks, vehicles = neighbors.shape
     linked = neighbors.vehicles
-    # The smallest number that has reached each vehicle along its links; to look up that one's own is to jump ahead.
+    # Each vehicle takes the smallest label among its neighbors'; following the label's own label halves the rounds.
     labels = np.arange(flocks * vehicles)
     while True:
         lower = labels.copy()

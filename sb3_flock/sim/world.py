@@ -1,29 +1,70 @@
-"""World: many flocks flown side by side as arrays (section III-A and V)."""
+"""World: many independent flocks of one scenario, simulated in lockstep as arrays (sections III-A and V)."""
 
 from __future__ import annotations
 
 import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
+from pydantic import Field, model_validator
 
-from sb3_flock.settings import UserError
-from sb3_flock.sim.sensing import Sensing, sense
-from sb3_flock.sim.sensors import Sensors
+from sb3_flock.settings import Coordinate, NotNegative, Positive, UserError
+from sb3_flock.sim.dynamics import directions_of, move, turn, wrap_angle
+from sb3_flock.sim.sensing import Sensing, SensingSettings, sense
+from sb3_flock.sim.sensors import Sensors, SensorSettings
 
 if TYPE_CHECKING:
     from numpy.random import Generator
     from numpy.typing import ArrayLike, NDArray
 
-    from sb3_flock.sim.scenario import Scenario
-
 _MAX_REDRAWS = 1000
-"""Draws allowed for one body's start before the arena counts as too crowded."""
+"""Largest number of draws for one body's start before the arena counts as too crowded."""
 
 _SLOWEST_CROSSING = 0.6
-"""Slowest crossing obstacle [top speeds]: from the arena's edge to the origin in 100 to 167 steps, when the flock is there."""
+"""Lowest speed of a crossing obstacle [top speeds]: such an obstacle reaches the origin after 100 to 167 steps, when the
+flock is there."""
+
+Points = Annotated[tuple[tuple[Coordinate, Coordinate], ...], Field(min_length=1, max_length=10_000)]
+"""Positions ``[[x, y], ...]`` [m]."""
+
+
+class WorldSettings(SensingSettings, SensorSettings):
+    """The arena, the starts and the waypoint (section V)."""
+
+    waypoint_speed: NotNegative = Field(0.1, description="speed of the waypoint towards the origin [m/s] (paper: 0.1)")
+    waypoint_route: Points | None = Field(
+        None,
+        description="points [x, y] that the waypoint visits one after the other [m]; "
+        "null: from a random start to the origin (paper: null)",
+    )
+    arena: Positive = Field(1.0, description="half side of the square in which all bodies start [m] (paper: 1)")
+    obstacle_arena: Positive | None = Field(
+        None, description="half side of the square in which obstacles start and walk [m]; null: arena (paper: null)"
+    )
+    obstacle_starts: Points | None = Field(
+        None,
+        description="points [x, y] where obstacles start [m]; with obstacle_max_speed 0 they stay there; "
+        "null: random (paper: null)",
+    )
+
+    @model_validator(mode="after")
+    def _starts_fit(self) -> WorldSettings:
+        if len(self.obstacle_starts or ()) > self.n_obstacles:
+            raise ValueError(
+                f"obstacle_starts has {len(self.obstacle_starts or ())} points: n_obstacles = {self.n_obstacles}"
+            )
+        for point in self.obstacle_starts or ():
+            if max(map(abs, point)) > self.obstacle_half_side:
+                square = f"the obstacles' square of half side {self.obstacle_half_side}"
+                raise ValueError(f"obstacle_starts: {point} is outside {square}")
+        return self
+
+    @property
+    def obstacle_half_side(self) -> float:
+        """Half side of the square in which obstacles start and walk [m]."""
+        return self.arena if self.obstacle_arena is None else self.obstacle_arena
 
 
 _EPISODE = (
@@ -35,7 +76,7 @@ _EPISODE = (
     "obstacle_speeds",
     "obstacle_turn_rates",
 )
-"""The arrays of an episode under way."""
+"""The arrays of the current episode."""
 
 
 class WorldError(UserError):
@@ -43,17 +84,17 @@ class WorldError(UserError):
 
 
 def episode_rng(seed: int, episode: int) -> Generator:
-    """The random stream of one episode: it depends on the seed and the episode's number, never on how many fly at once."""
+    """The random stream of one episode: it depends on the seed and the episode's number, never on the batch size."""
     return np.random.default_rng(np.random.SeedSequence([seed, episode]))
 
 
 class World:
     """``n_flocks`` independent flocks of one scenario, advanced in lockstep.
 
-    Every flock draws from its own generator, and a whole episode's obstacle walk is drawn at the reset: a flock's course
-    depends on its generator and its actions alone.
+    Every flock draws from its own generator, and the obstacles' random walk is drawn for the whole episode at the reset: a
+    flock's trajectory depends on its generator and its actions alone.
 
-    :param scenario: every number of the task
+    :param scenario: the task, a :class:`~sb3_flock.sim.Scenario`
     :param n_flocks: number of flocks, at least 1
     """
 
@@ -72,13 +113,13 @@ class World:
     steps: int
     """Steps taken since the reset, k."""
 
-    def __init__(self, scenario: Scenario, n_flocks: int = 1) -> None:
+    def __init__(self, scenario: WorldSettings, n_flocks: int = 1) -> None:
         self.scenario = scenario
         self.n_flocks = n_flocks
         self.sensors = Sensors(scenario)
         self.action_low = np.array([0.0, -scenario.max_turn_rate])
         self.action_high = np.array([scenario.max_speed, scenario.max_turn_rate])
-        # As large as the actions: NumPy is slow where it repeats a bound along a last axis this short.
+        # As large as the actions: NumPy broadcasts slowly along a last axis this short.
         shape = (n_flocks, scenario.n_vehicles, 2)
         self._bounds = [np.broadcast_to(bound, shape).copy() for bound in (self.action_low, self.action_high)]
 
@@ -97,36 +138,22 @@ class World:
     def frames(self) -> NDArray[np.float64]:
         """Cosine and sine of the headings, ``(flocks, vehicles, 2)``."""
         if self._frames is None:
-            self._frames = _directions(self._headings)
+            self._frames = directions_of(self._headings)
         return self._frames
 
-    def waypoints_after(self, steps: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Where the waypoint will be: straight towards the origin (section V), or along the route.
+    def sense(self, ego_motion: NDArray[np.float64] | None = None) -> Sensing:
+        """Everything the vehicles sense in the present state, without sensor errors (section III-A).
 
-        :param steps: from now on, any number for each flock, ``(flocks, any)``
-        :return: ``(flocks, any, 2)`` [m]
+        :param ego_motion: :attr:`Sensing.ego_motion`; ``None`` at the start
         """
-        route, stride = self.scenario.waypoint_route, self.scenario.waypoint_speed * self.scenario.time_step
-        if route is not None:
-            return along(np.array(route), stride * (self.steps + steps))
-        distances = np.sqrt(np.square(self.waypoints).sum(-1, keepdims=True))
-        return self.waypoints[:, None] * (1.0 - np.minimum(stride * steps / np.maximum(distances, 1e-12), 1.0))[..., None]
-
-    def obstacles_after(self, steps: NDArray[np.integer]) -> NDArray[np.float64]:
-        """Where obstacles are to be expected: straight ahead, at their mean speed of the episode.
-
-        :param steps: from now on, ``(any,)``
-        :return: ``(flocks, any, obstacles, 2)`` [m]
-        """
-        strides = self.obstacle_speeds.mean(0)[..., None] * _directions(self.obstacle_headings) * self.scenario.time_step
-        return self.obstacle_positions[:, None] + strides[:, None] * steps[:, None, None]
+        return sense(self.positions, self.frames, self.obstacle_positions, self.waypoints, self.scenario, ego_motion)
 
     def reset(self, rngs: Sequence[Generator]) -> Sensing:
         """Start an episode in every flock (section V).
 
         Vehicles and obstacles are uniform in their squares with uniform headings, the waypoint is uniform in the arena. A
-        body that starts closer to a vehicle than its minimum separation is drawn again. A route and given starts (ours) stand
-        in for what is drawn otherwise.
+        body that starts closer to a vehicle than its minimum separation is drawn again. ``waypoint_route`` and
+        ``obstacle_starts`` replace the random ones.
 
         :param rngs: one generator a flock
         :return: what the vehicles sense at the start
@@ -139,12 +166,12 @@ class World:
         self.positions, self.headings, self.obstacle_positions, self.obstacle_headings, self.waypoints = (
             np.stack(parts) for parts in zip(*starts, strict=True)
         )
-        courses = [self._course(rng) for rng in rngs]
-        self.obstacle_speeds = np.stack([speeds for speeds, _ in courses], axis=1)
-        self.obstacle_turn_rates = np.stack([turns for _, turns in courses], axis=1) * scenario.obstacle_turn_std
+        walks = [self._walk(rng) for rng in rngs]
+        self.obstacle_speeds = np.stack([speeds for speeds, _ in walks], axis=1)
+        self.obstacle_turn_rates = np.stack([turns for _, turns in walks], axis=1) * scenario.obstacle_turn_std
         self.sensors.reset(rngs)
         self.steps = 0
-        return sense(self)
+        return self.sense()
 
     def step(self, actions: ArrayLike) -> tuple[Sensing, NDArray[np.float64]]:
         """Move every body by one sampling period, vehicles, obstacles and waypoint together (section III-A).
@@ -155,18 +182,18 @@ class World:
         """
         scenario = self.scenario
         if not hasattr(self, "steps") or self.steps >= scenario.max_cycles:
-            raise RuntimeError("the episode is over or not begun: call reset() first")
+            raise RuntimeError("no episode is running: call reset() first")
         clipped = np.clip(np.asarray(actions, dtype=np.float64), *self._bounds)
         dt = scenario.time_step
-        self.positions = _moved(self.positions, self.frames, clipped[..., 0], dt)
-        self.headings = wrap_angle(self.headings + clipped[..., 1] * dt)
+        self.positions = move(self.positions, self.frames, clipped[..., 0], dt)
+        self.headings = turn(self.headings, clipped[..., 1], dt)
         self._move_obstacles(dt)
-        self.waypoints = self.waypoints_after(np.ones((self.n_flocks, 1)))[:, 0]
+        self.waypoints = waypoints_ahead(scenario, self.waypoints, self.steps, np.ones((self.n_flocks, 1)))[:, 0]
         self.steps += 1
-        return sense(self, clipped * dt), clipped
+        return self.sense(clipped * dt), clipped
 
     def state_dict(self) -> dict[str, Any]:
-        """The episode under way: all that its next steps depend on besides the actions."""
+        """The current episode: everything its next steps depend on besides the actions."""
         return {
             **{name: getattr(self, name) for name in _EPISODE},
             "steps": self.steps,
@@ -174,9 +201,9 @@ class World:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on with the episode of :meth:`state_dict`.
+        """Restore the episode of :meth:`state_dict`.
 
-        :raises ValueError: if it is one of other numbers of bodies or steps
+        :raises ValueError: if its numbers of bodies or steps are others
         """
         flocks, vehicles, obstacles = self.n_flocks, self.scenario.n_vehicles, self.scenario.n_obstacles
         walk = (self.scenario.max_cycles, flocks, obstacles)
@@ -200,7 +227,7 @@ class World:
         """Unicycles with drawn speeds and turn rates, turned back at the edge of their square."""
         bound = self.scenario.obstacle_half_side
         speeds, turn_rates = self.obstacle_speeds[self.steps], self.obstacle_turn_rates[self.steps]
-        positions = _moved(self.obstacle_positions, _directions(self.obstacle_headings), speeds, dt)
+        positions = move(self.obstacle_positions, directions_of(self.obstacle_headings), speeds, dt)
         outside = np.maximum(np.abs(positions[..., 0]), np.abs(positions[..., 1])) > bound
         self.obstacle_positions = np.clip(positions, -bound, bound)
         self.obstacle_headings = wrap_angle(self.obstacle_headings + turn_rates * dt + np.pi * outside)
@@ -249,8 +276,8 @@ class World:
         aims = rng.uniform(-scenario.link_range, scenario.link_range, (count, 2)) - starts
         return starts, np.arctan2(aims[:, 1], aims[:, 0])
 
-    def _course(self, rng: Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """An episode's speeds [m/s] and turn rates [standard deviations] of the obstacles, each ``(steps, obstacles)``."""
+    def _walk(self, rng: Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The obstacles' speeds [m/s] and turn rates [standard deviations] of a whole episode, each ``(steps, obstacles)``."""
         shape = (self.scenario.max_cycles, self.scenario.n_obstacles)
         top = self.scenario.obstacle_max_speed
         if self.scenario.obstacle_motion == "crossing":
@@ -258,31 +285,32 @@ class World:
         return rng.uniform(0.0, top, shape), rng.normal(0.0, 1.0, shape)
 
 
-def _moved(
-    positions: NDArray[np.float64], directions: NDArray[np.float64], speeds: NDArray[np.float64], dt: float
+def waypoints_ahead(
+    settings: WorldSettings, waypoints: NDArray[np.float64], steps: int, ahead: NDArray[np.floating]
 ) -> NDArray[np.float64]:
-    """The discrete unicycle's position, which moves with the old heading (section III-A); the heading turns afterwards."""
-    return positions + (speeds * dt)[..., None] * directions
+    """The waypoint's positions some steps ahead: straight towards the origin (section V), or along the route.
 
-
-def _directions(headings: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Cosine and sine, ``(..., 2)``."""
-    return np.stack((np.cos(headings), np.sin(headings)), axis=-1)
+    :param settings: the waypoint's speed and route
+    :param waypoints: present positions, ``(flocks, 2)`` [m]
+    :param steps: steps since the reset
+    :param ahead: steps from now, any number for each flock, ``(flocks, any)``
+    :return: ``(flocks, any, 2)`` [m]
+    """
+    route, stride = settings.waypoint_route, settings.waypoint_speed * settings.time_step
+    if route is not None:
+        return along(np.array(route), stride * (steps + ahead))
+    distances = np.sqrt(np.square(waypoints).sum(-1, keepdims=True))
+    return waypoints[:, None] * (1.0 - np.minimum(stride * ahead / np.maximum(distances, 1e-12), 1.0))[..., None]
 
 
 def along(route: NDArray[np.float64], distances: NDArray[np.floating]) -> NDArray[np.float64]:
-    """The points so far ``(...)`` along a route ``(points, 2)`` [m], ``(..., 2)``; at its end beyond."""
+    """The points at distances ``(...)`` along a route ``(points, 2)`` [m], ``(..., 2)``; beyond its end, the end."""
     lengths = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(route, axis=0).T))))
     return np.stack([np.interp(distances, lengths, coordinate) for coordinate in route.T], axis=-1)
 
 
-def wrap_angle(angles: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Angles in [-pi, pi) [rad]."""
-    return angles - 2 * np.pi * np.floor((angles + np.pi) / (2 * np.pi))
-
-
 class _Placed:
-    """Vehicles placed so far, in square cells of the separation to keep from them: only nine cells need a look."""
+    """Vehicles placed so far, in square cells as wide as the minimum separation: a new point is checked against nine cells."""
 
     def __init__(self, separation: float, points: Iterable[Sequence[float]] = ()) -> None:
         self.separation = separation
@@ -291,16 +319,16 @@ class _Placed:
             self.add(x, y)
 
     def add(self, x: float, y: float) -> None:
-        if self.separation == 0:  # nothing is ever too close
+        if self.separation == 0:  # no point can violate it
             return
         self._cells.setdefault(self._cell(x, y), []).append((x, y))
 
     def draw_apart(
-        self, rng: Generator, half_side: float, name: str, count: int, others: _Placed | None = None
+        self, rng: Generator, half_side: float, name: str, count: int, also: _Placed | None = None
     ) -> NDArray[np.float64]:
-        """A point uniform in the square, drawn again while it is closer than the separation to one of these or of others."""
+        """A point uniform in the square, drawn again while it is closer than the separation to one of these, or of ``also``."""
         where = f"a square of half side {half_side} m"
-        return self.draw(lambda: rng.uniform(-half_side, half_side, 2), where, name, count, others)
+        return self.draw(lambda: rng.uniform(-half_side, half_side, 2), where, name, count, also)
 
     def draw(
         self,
@@ -308,12 +336,12 @@ class _Placed:
         where: str,
         name: str,
         count: int,
-        others: _Placed | None = None,
+        also: _Placed | None = None,
     ) -> NDArray[np.float64]:
-        """A point that a function draws, drawn again while it is closer than the separation to one of these or of others."""
+        """A point that a function draws, drawn again while it is closer than the separation to one of these, or of ``also``."""
         for _ in range(_MAX_REDRAWS):
             point = point_of()
-            if self._is_free(*point.tolist()) and (others is None or others._is_free(*point.tolist())):
+            if self._is_free(*point.tolist()) and (also is None or also._is_free(*point.tolist())):
                 return point
         raise WorldError(
             f"{name} = {count}: no start at least {self.separation} m from the others found in {_MAX_REDRAWS} draws "

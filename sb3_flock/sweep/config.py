@@ -10,10 +10,10 @@ from typing import Any
 
 from pydantic import Field, model_validator
 
+from sb3_flock.config.training import TrainingConfig
 from sb3_flock.evaluation.metrics import METRICS
-from sb3_flock.rl.config import TrainingConfig
-from sb3_flock.rl.config_io import load_config, read_yaml
-from sb3_flock.settings import Settings, SettingsError, field_of, resolve_path, shown
+from sb3_flock.serialization.yaml_io import load_config, read_yaml
+from sb3_flock.settings import Settings, SettingsError, field_of, format_value, resolve_path
 from sb3_flock.sim import Scenario
 
 MAX_TRIALS = 100_000
@@ -74,11 +74,11 @@ class SweepConfig(Settings):
             raise ValueError("search: a policy is flown over a grid")
         for key, values in {**self.grid, **self.search}.items():
             if isinstance(values, list) and (not values or any(value in values[:i] for i, value in enumerate(values))):
-                raise ValueError(f"{key} = {shown(values)}: a list of different values is needed")
+                raise ValueError(f"{key} = {format_value(values)}: a list of different values is needed")
         if math.prod(map(len, self.grid.values())) > MAX_TRIALS:
             raise ValueError(f"grid: more than {MAX_TRIALS} trials")
         if self.metric != "score" and self.metric not in METRICS:
-            raise ValueError(f"metric = {shown(self.metric)}: score or one of {', '.join(METRICS)} is needed")
+            raise ValueError(f"metric = {format_value(self.metric)}: score or one of {', '.join(METRICS)} is needed")
         unknown = [task for task in self.tasks if task not in self.grid]
         if unknown:
             raise ValueError(f"tasks = {unknown[0]}: a field of the grid is needed")
@@ -143,13 +143,13 @@ def load_sweep(
     values = {**read_yaml(Path(path), text), **changes}
     for name in ("grid", "search"):  # a list or a scalar is told by name before it is taken apart
         if not isinstance(values.get(name, {}), Mapping):
-            raise SettingsError(f"{name} = {shown(values[name])}: a mapping of fields to values is needed")
+            raise SettingsError(f"{name} = {format_value(values[name])}: a mapping of fields to values is needed")
     shared = values.get("base") or {}
     if isinstance(shared, str):
         whole = load_config(TrainingConfig, Path(path).parent / shared).model_dump(mode="json")
         shared = {name: value for name, value in whole.items() if name not in _GIVEN}
     if not isinstance(shared, Mapping):
-        raise SettingsError(f"base = {shown(shared)}: a config's file or a mapping of its fields is needed")
+        raise SettingsError(f"base = {format_value(shared)}: a config's file or a mapping of its fields is needed")
     added = _named_in_full((base or {}).items())
     idle = [name for name in added if values.get("policy") is not None and not name.startswith(_SCENARIO)]
     if idle:

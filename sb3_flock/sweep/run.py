@@ -16,8 +16,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sb3_flock._compat import find_ray_cluster, ray_trials
 from sb3_flock.evaluation.metrics import METRICS
-from sb3_flock.rl.config_io import to_yaml
+from sb3_flock.serialization.yaml_io import to_yaml
 from sb3_flock.settings import RunError, SettingsError
 from sb3_flock.sweep.config import SweepConfig, is_whole, load_sweep
 
@@ -148,7 +149,7 @@ def _check_points(config: SweepConfig) -> bytes | None:
             if config.search and trained.eval_freq == 0:
                 raise SettingsError("eval_freq = 0: a search needs evaluations")
         return None
-    from sb3_flock.rl.loading import load_policy
+    from sb3_flock.serialization.load import load_policy
 
     flyer = load_policy(config.policy)
     for point in config.points():
@@ -163,10 +164,8 @@ def _check_ray(address: str | None) -> None:
         raise SettingsError(f"a sweep needs {missing[0]}: pip install 'sb3_flock[ray]'")
     if address is None:
         return
-    from ray._private.services import canonicalize_bootstrap_address
-
     try:
-        found = canonicalize_bootstrap_address(address) or ""
+        found = find_ray_cluster(address)
         host, _, port = found.removeprefix("ray://").rpartition(":")
         socket.create_connection((host, int(port)), timeout=10).close()
     except (OSError, ValueError) as error:
@@ -213,7 +212,7 @@ def _run(config: SweepConfig, folder: Folder, policy: bytes | None) -> list[Tria
         else:
             tuner = _new_tuner(config, folder, trial, storage)
         results = tuner.fit()
-        ended = [_ended(trial, folder) for trial in results._experiment_analysis.trials]
+        ended = [_ended(trial, folder) for trial in ray_trials(results)]
         trials = sorted(ended, key=lambda trial: trial.name)
     except tune.TuneError as error:
         raise RunError(f"{str(error).strip().splitlines()[-1]}; to go on: sb3-flock sweep --resume {folder.name}") from error

@@ -18,12 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
-from sb3_flock.evaluation.figures import LINE_STYLES, new_figure, save_as
-from sb3_flock.evaluation.metrics import LARGER_IS_BETTER
-from sb3_flock.evaluation.report import SHORT_COLUMNS, add_short_columns, plain_table, short_cells
+from sb3_flock.evaluation.metrics import METRICS, is_higher_better
+from sb3_flock.evaluation.report import add_short_columns, plain_table, short_cells
 from sb3_flock.sweep.config import SweepConfig
 from sb3_flock.sweep.run import Folder, Trial, short
 from sb3_flock.sweep.trials import DONE
+from sb3_flock.viz.figures import LINE_STYLES, new_figure, save_as
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -90,8 +90,8 @@ def trials_table(config: SweepConfig, trials: Sequence[Trial]) -> Table:
     return table
 
 
-def _pattern(metric: str) -> str:
-    return SHORT_COLUMNS.get(metric, ("", "{:.3f}"))[1]
+def _format(metric: str, value: float) -> str:
+    return METRICS[metric].format(value) if metric in METRICS else f"{value:.3f}"
 
 
 def rank(config: SweepConfig, trials: Sequence[Trial], metric: str) -> list[Setting]:
@@ -102,7 +102,7 @@ def rank(config: SweepConfig, trials: Sequence[Trial], metric: str) -> list[Sett
     from rliable import metrics
 
     by_name = {name: _matrix(config, of, metric) for name, of in _by_setting(config, trials).items()}
-    sign = 1.0 if metric in LARGER_IS_BETTER else -1.0
+    sign = 1.0 if is_higher_better(metric) else -1.0
     larger_is_better = {name: sign * values for name, (values, _) in by_name.items() if values.size}
     if not larger_is_better:
         return []
@@ -162,16 +162,15 @@ def _intervals(scores: dict[str, Any], statistic: Callable[..., Any]) -> tuple[d
 
 def ranking_table(settings: Sequence[Setting], metric: str) -> Table:
     """The settings, best first, a line each."""
-    pattern = _pattern(metric)
     table = plain_table()
     table.add_column("setting", overflow="fold")
     for heading in ("runs", "lost", f"IQM {metric}", "95 % interval", "P(best better)"):
         table.add_column(heading, justify="right")
     for setting in settings:
-        span = f"{pattern.format(setting.low)} .. {pattern.format(setting.high)}"
+        span = f"{_format(metric, setting.low)} .. {_format(metric, setting.high)}"
         beaten = f"{setting.beaten:.2f} ({setting.beaten_low:.2f} .. {setting.beaten_high:.2f})"
         shape = str(len(setting.values)), str(setting.lost)
-        table.add_row(setting.name, *shape, pattern.format(setting.mean), span, "" if np.isnan(setting.beaten) else beaten)
+        table.add_row(setting.name, *shape, _format(metric, setting.mean), span, "" if np.isnan(setting.beaten) else beaten)
     return table
 
 
@@ -202,7 +201,7 @@ def ranking_figure(settings: Sequence[Setting], metric: str) -> Figure:
     means.invert_yaxis()
     means.set(xlabel=metric, title="interquartile mean, 95 % interval, runs")
 
-    larger = metric in LARGER_IS_BETTER
+    larger = is_higher_better(metric)
     sign = 1.0 if larger else -1.0
     everything = np.concatenate([setting.values.ravel() for setting in settings])
     margin = 0.05 * (everything.max() - everything.min()) or 0.5

@@ -12,7 +12,8 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from sb3_flock.evaluation.report import SHORT_COLUMNS, add_short_columns, plain_table, short_cells
+from sb3_flock.evaluation.metrics import columns
+from sb3_flock.evaluation.report import add_short_columns, plain_table, short_cells
 
 _OTHER_COLUMNS = 54
 """Width of the table beside the trials' names."""
@@ -49,7 +50,7 @@ class TrialsTable(tune.Callback):
     def on_trial_complete(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
         """A trial has ended by itself."""
         self._ended.append(trial)
-        named = zip((heading for heading, _ in SHORT_COLUMNS.values()), _cells(trial), strict=True)
+        named = zip((metric.column for metric in columns().values()), _cells(trial), strict=True)
         self._tell(trials, f"{trial}: {', '.join([_state(trial), *(f'{name} {cell}' for name, cell in named if cell)])}")
 
     def on_trial_error(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:

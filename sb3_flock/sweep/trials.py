@@ -15,15 +15,14 @@ from ray import tune
 from rich.console import Console
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_flock.config.training import TrainingConfig
 from sb3_flock.evaluation import evaluate
-from sb3_flock.evaluation.metrics import Metric, score
-from sb3_flock.evaluation.report import SHORT_COLUMNS
-from sb3_flock.rl.config import TrainingConfig
-from sb3_flock.rl.loading import LoadedPolicy, checkpoint_paths, load_policy
-from sb3_flock.rl.safety import DivergedError
-from sb3_flock.rl.training import resume, train
+from sb3_flock.evaluation.metrics import Metric, columns, score
+from sb3_flock.rl.callbacks import DivergedError
+from sb3_flock.serialization.load import LoadedPolicy, checkpoint_paths, load_policy
 from sb3_flock.settings import UserError
 from sb3_flock.sweep.config import SweepConfig
+from sb3_flock.training.train import resume, train
 
 TEST_SEED = 0
 """Seed of the episodes that a trained policy is tested on: those of ``sb3-flock train``'s table, which nothing is chosen by."""
@@ -47,7 +46,7 @@ def train_trial(point: dict[str, Any], sweep: Mapping[str, Any]) -> None:
         folder = _train_or_go_on(config, reports)
         reports.read(folder)
         th.set_num_threads(1)
-        metrics = evaluate(load_policy(folder), config.scenario, config.test_episodes, TEST_SEED)
+        metrics = evaluate(load_policy(folder), config.scenario, config.n_test_episodes, TEST_SEED)
         minutes = reports.row.get("minutes", (time.monotonic() - started) / 60)
         ended = {"status": DONE, "timesteps": config.total_timesteps, "minutes": minutes}
         tune.report({**reports.row, **ended, **_tested(metrics)}, checkpoint=tune.Checkpoint.from_directory(folder))
@@ -106,7 +105,7 @@ class Reports(BaseCallback):
         evaluated = history.stat().st_mtime_ns if history.exists() else 0
         if evaluated != seen[1]:
             with np.load(history, allow_pickle=False) as curves:
-                self.row.update({name: float(curves[name][-1]) for name in SHORT_COLUMNS})
+                self.row.update({name: float(curves[name][-1]) for name in columns()})
                 self.row.update(score=float(curves["score"].min()), minutes=float(curves["seconds"][-1]) / 60)
         return saved[0] if saved else None, evaluated
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 PEERS = Path(__file__).parent / "peers"
-POLICY = "paper-5v2o"
+POLICY = "ddpg-5v2o"
 """The shipped policy whose flocks are measured."""
 
 

@@ -22,22 +22,23 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from sb3_flock.evaluation.controllers import Foresight, Orca
-from sb3_flock.evaluation.controllers.foresight import ForesightGains
-from sb3_flock.evaluation.episodes import Controller, fly_together
-from sb3_flock.rl.config import TrainingConfig
-from sb3_flock.rl.config_io import load_config
+from sb3_flock.config.training import TrainingConfig
+from sb3_flock.controllers import MPC, Orca
+from sb3_flock.controllers.base import Controller
+from sb3_flock.controllers.mpc import MPCConfig
+from sb3_flock.evaluation.rollout import rollout_batch
+from sb3_flock.serialization.yaml_io import load_config
 from sb3_flock.sim import Scenario, Sensing, World, episode_rng
 
 CROSSING = Scenario(n_vehicles=5, n_obstacles=2, obstacle_motion="crossing")
 SEED = 1
 COLUMNS = ("tracking_error", "neighbor_violation_rate", "obstacle_violation_rate", "connectivity", "mean_separation")
 
-SHARED = ForesightGains(separation=1.03, slack=6.0, rounds=400)
+SHARED = MPCConfig(separation=1.03, slack=6.0, rounds=400)
 ALL = SHARED.replace(sight=1e6)
 
 
-class Disturbed(Foresight):
+class Disturbed(MPC):
     """Whose controls err by 0.3 of their bounds (standard deviation), 0.8 of it from one step to the next."""
 
     def reset(self, rngs: Sequence[Generator], scenario: Scenario) -> None:
@@ -53,14 +54,14 @@ class Disturbed(Foresight):
 
 def print_flight(name: str, scenario: Scenario, pilot: Callable[[World], Controller], episodes: int) -> None:
     """Fly and print a line of metrics."""
-    results = fly_together(pilot, scenario, [episode_rng(SEED, episode) for episode in range(episodes)])
+    results = rollout_batch(pilot, scenario, [episode_rng(SEED, episode) for episode in range(episodes)])
     print(name, *(f"{np.nanmean(results[column]):.4f}" for column in COLUMNS), sep="; ", flush=True)
 
 
-def crossing_teacher() -> ForesightGains:
+def crossing_teacher() -> MPCConfig:
     """What the teacher of ``configs/crossing_5v2o.yaml`` keeps, in separations of the task."""
     config = load_config(TrainingConfig, Path(__file__).parents[2] / "configs" / "crossing_5v2o.yaml")
-    task, (flown,), gains = config.scenario, config.flown_scenarios(), config.practice.foresight
+    task, (flown,), gains = config.scenario, config.training_scenarios(), config.train_env.mpc
     return gains.replace(
         separation=gains.separation * flown.neighbor_separation / task.neighbor_separation,
         clearance=gains.clearance * flown.obstacle_separation / task.obstacle_separation,
@@ -73,10 +74,10 @@ def main(episodes: int = 100) -> None:
     tasks = {f"({n}, {m})": Scenario(n_vehicles=n, n_obstacles=m) for n, m in ((3, 1), (5, 1), (5, 2))}
     for task, scenario in {**tasks, "crossing": CROSSING}.items():
         print_flight(f"{task}, orca", scenario, lambda world: Orca(), episodes)
-        print_flight(f"{task}, foresight", scenario, Foresight, episodes)
-        print_flight(f"{task}, shared", scenario, partial(Foresight, gains=SHARED), episodes)
-        print_flight(f"{task}, all", scenario, partial(Foresight, gains=ALL), episodes)
-    print_flight("crossing, crossing", CROSSING, partial(Foresight, gains=crossing_teacher()), episodes)
+        print_flight(f"{task}, foresight", scenario, MPC, episodes)
+        print_flight(f"{task}, shared", scenario, partial(MPC, gains=SHARED), episodes)
+        print_flight(f"{task}, all", scenario, partial(MPC, gains=ALL), episodes)
+    print_flight("crossing, crossing", CROSSING, partial(MPC, gains=crossing_teacher()), episodes)
     print_flight("crossing, foresight, disturbed", CROSSING, Disturbed, episodes)
     print_flight("crossing, crossing, disturbed", CROSSING, partial(Disturbed, gains=crossing_teacher()), episodes)
 

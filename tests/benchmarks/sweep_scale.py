@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 TRAINING = {
-    "total_timesteps": 10_000, "eval_freq": 0, "save_freq": 5_000, "keep_checkpoints": 1, "test_episodes": 1,
+    "total_timesteps": 10_000, "eval_freq": 0, "save_freq": 5_000, "keep_checkpoints": 1, "n_test_episodes": 1,
 }  # fmt: skip
 
 

@@ -9,11 +9,11 @@ from stable_baselines3 import DDPG
 from stable_baselines3.common.logger import configure
 
 from sb3_flock import CompactReplayBuffer, FlockCNN, FlockDDPG, FlockPolicy, evaluate, load_policy, make_vec_env, train
-from sb3_flock.rl.algorithms import policy_kwargs
-from sb3_flock.rl.config import TrainingConfig
-from sb3_flock.rl.config_io import load_config
+from sb3_flock.config.training import TrainingConfig
+from sb3_flock.rl.registry import policy_kwargs
+from sb3_flock.serialization.yaml_io import load_config
 from tests.benchmarks.conftest import POLICY
-from tests.rl.test_ddpg import PlainCNN
+from tests.helpers import PlainCNN
 
 CONFIG = load_config(TrainingConfig, overrides={"n_vehicles": 5, "n_obstacles": 2})
 UPDATES = 25
@@ -21,7 +21,7 @@ UPDATES = 25
 
 KINDS = {
     "stock": (DDPG, PlainCNN, False, None),  # SB3's DDPG, torch's convolutions and Adam, SB3's buffer
-    "stock with our extractor and fused Adam": (DDPG, FlockCNN, True, None),  # --algo ddpg-stock
+    "stock with our extractor and fused Adam": (DDPG, FlockCNN, True, None),  # --algo ddpg-sb3
     "ours": (FlockDDPG, FlockCNN, True, CompactReplayBuffer),  # --algo ddpg
 }
 
@@ -32,7 +32,7 @@ def learner(kind, env):
     model = algorithm(
         FlockPolicy,
         env,
-        batch_size=CONFIG.learner.batch_size,
+        batch_size=CONFIG.algorithm.batch_size,
         buffer_size=10_000,
         learning_starts=10_000,
         replay_buffer_class=buffer,
@@ -49,14 +49,14 @@ def learner(kind, env):
 
 def test_updates(benchmark):
     """Rounds of updates of each kind in turn, so that whatever else the machine does falls on all of them."""
-    env = make_vec_env(CONFIG.flown_scenarios()[0], 8, seed=0)
+    env = make_vec_env(CONFIG.training_scenarios()[0], 8, seed=0)
     models = {kind: learner(kind, env) for kind in KINDS}
     seconds = {kind: [] for kind in KINDS}
 
     def one_round():
         for kind, model in models.items():
             start = time.perf_counter()
-            model.train(UPDATES, CONFIG.learner.batch_size)
+            model.train(UPDATES, CONFIG.algorithm.batch_size)
             seconds[kind].append(time.perf_counter() - start)
 
     benchmark.pedantic(one_round, rounds=20, warmup_rounds=2)
@@ -122,8 +122,8 @@ def test_peers_in_training(benchmark, peer, tmp_path, name):
     seconds, updates = [], []
     config = CONFIG.replace(
         total_timesteps=16_000, output_dir=str(tmp_path), eval_freq=0, save_freq=0,
-        practice=CONFIG.practice.replace(vehicles=5),
-        learner=CONFIG.learner.replace(learning_starts=200),
+        train_env=CONFIG.train_env.replace(vehicles=5),
+        algorithm=CONFIG.algorithm.replace(learning_starts=200),
     )  # fmt: skip
 
     def run():
@@ -133,8 +133,8 @@ def test_peers_in_training(benchmark, peer, tmp_path, name):
 
     benchmark.pedantic(run, rounds=1)
     theirs = peer(
-        "training.py", name, "--vehicles", 5, "--flocks", 8, "--batch", config.learner.batch_size,
-        "--update-ratio", config.learner.update_ratio, "--seconds", 60,
+        "training.py", name, "--vehicles", 5, "--flocks", 8, "--batch", config.algorithm.batch_size,
+        "--update-ratio", config.algorithm.utd_ratio, "--seconds", 60,
     )  # fmt: skip
     ours = {
         "env_steps_per_second": config.total_timesteps / seconds[-1],

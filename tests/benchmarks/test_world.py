@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sb3_flock import Scenario, World, load_policy
-from sb3_flock.evaluation.episodes import PolicyController
+from sb3_flock.controllers.policy import PolicyController
 from sb3_flock.sim import episode_rng, mix_rewards, observe, own_reward, reward_terms, sensing
 from sb3_flock.sim.backend import compiled
 from tests.benchmarks.conftest import POLICY

@@ -34,7 +34,7 @@ def train_until_it_holds(n_vehicles: int, n_obstacles: int, seed: int, changes: 
 
     from sb3_flock import TrainingConfig, evaluate, load_policy, train
     from sb3_flock.evaluation.report import PAPER
-    from sb3_flock.rl.config_io import load_config, parse_overrides
+    from sb3_flock.serialization.yaml_io import load_config, parse_overrides
 
     paper = PAPER[n_vehicles, n_obstacles]["Table II"]
 

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 
 from sb3_flock import Scenario
-from sb3_flock.evaluation.controllers.olfati_saber import OlfatiGains, OlfatiSaber
-from sb3_flock.evaluation.controllers.orca import Orca, OrcaGains
-from sb3_flock.evaluation.episodes import fly
+from sb3_flock.controllers.olfati_saber import OlfatiGains, OlfatiSaber
+from sb3_flock.controllers.orca import Orca, OrcaGains
 from sb3_flock.evaluation.metrics import score
-from sb3_flock.rl.selection import SELECTION_SEED
+from sb3_flock.evaluation.rollout import fly
+from sb3_flock.training.eval_callback import SELECTION_SEED
 
 RANGES: dict[str, tuple[Any, Any, dict[str, tuple[float, float]]]] = {
     "orca": (

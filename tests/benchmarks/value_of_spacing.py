@@ -1,4 +1,4 @@
-"""What a critic believes of a tight pack, and what is true: ``python tests/benchmarks/value_of_spacing.py paper-5v2o value.png``.
+"""What a critic believes of a tight pack, and what is true: ``python tests/benchmarks/value_of_spacing.py ddpg-5v2o value.png``.
 
 Three vehicles stand around the waypoint, each at the same distance from the other two and facing anywhere. The critics' value of
 that is compared with the discounted reward that the same policy then collects in practice: without exploration, and with some.
@@ -13,10 +13,10 @@ import numpy as np
 import torch as th
 
 from sb3_flock import load_policy
-from sb3_flock.evaluation.episodes import PolicyController
-from sb3_flock.evaluation.figures import new_figure, save_as
-from sb3_flock.rl.loading import LoadedPolicy
+from sb3_flock.controllers.policy import PolicyController
+from sb3_flock.serialization.load import LoadedPolicy
 from sb3_flock.sim import Scenario, World, episode_rng, observe, own_reward, reward_terms, sense
+from sb3_flock.viz.figures import new_figure, save_as
 
 SPACINGS = np.round(np.arange(0.09, 0.1491, 0.003), 3)
 FLOCKS = 256
@@ -55,7 +55,7 @@ def collected(policy: LoadedPolicy, world: World, noise: float) -> float:
         actions = controller.act(world.sensors.measure(sensing), scenario)
         sensing, clipped = world.step(actions + noise * half_range * rng.normal(size=actions.shape))
         reward = own_reward(reward_terms(sensing, clipped, scenario)).mean()
-        total += policy.config.learner.gamma**step * float(reward)
+        total += policy.config.algorithm.gamma**step * float(reward)
     return total / scenario.reward.scale
 
 
@@ -63,7 +63,7 @@ def main(name: str, picture: str | None = None) -> None:
     """Print the three values by spacing; draw them, too."""
     th.set_num_threads(1)
     policy = load_policy(name)
-    scenario = policy.config.flown_scenarios()[0].replace(n_vehicles=3, n_obstacles=0)
+    scenario = policy.config.training_scenarios()[0].replace(n_vehicles=3, n_obstacles=0)
     columns = {
         "believed": [believed(policy, triangles(scenario, spacing)) for spacing in SPACINGS],
         "true": [collected(policy, triangles(scenario, spacing), 0.0) for spacing in SPACINGS],

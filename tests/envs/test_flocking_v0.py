@@ -25,7 +25,7 @@ VARIANTS = [
     {"n_vehicles": 5, "n_obstacles": 2},
     {"n_vehicles": 1, "n_obstacles": 0},
     {"n_vehicles": 2, "max_cycles": 7},
-    {"look_back": 0.2},
+    {"motion_lag": 0.2},
 ]
 
 

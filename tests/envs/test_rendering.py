@@ -3,7 +3,7 @@ import pytest
 
 from sb3_flock import flocking_v0
 from sb3_flock.envs.rendering import HEADER, SIDE, Renderer
-from tests.sim.conftest import place
+from tests.helpers import place
 
 VEHICLE, VIOLATION, OBSTACLE = (0, 114, 178), (213, 94, 0), (204, 121, 167)
 

@@ -4,7 +4,7 @@ import pytest
 from sb3_flock.evaluation import METRICS, EpisodeMetrics, summarize
 from sb3_flock.evaluation.metrics import score
 from sb3_flock.sim import Scenario, sense
-from tests.sim.conftest import place
+from tests.helpers import place
 
 SCENARIO = Scenario(n_vehicles=3, n_obstacles=1, max_cycles=4)
 

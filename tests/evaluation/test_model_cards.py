@@ -5,11 +5,12 @@ import pytest
 import torch as th
 
 from sb3_flock import FlockDDPG, evaluate, load_policy
+from sb3_flock.config.training import TrainingConfig
 from sb3_flock.evaluation import model_cards
 from sb3_flock.evaluation.model_cards import median_of_seeds, read_card, ship
-from sb3_flock.rl.config import TrainingConfig
-from sb3_flock.rl.loading import PolicyError, find_policy, shipped_policies
-from tests.rl.test_training import quiet, tiny, train
+from sb3_flock.pretrained import shipped_policies
+from sb3_flock.serialization.load import PolicyError, find_policy
+from tests.helpers import quiet, tiny, train
 
 SHIPPED = sorted(shipped_policies())
 
@@ -61,8 +62,8 @@ def test_a_card_keeps_every_training_and_the_zip_is_the_best_ones(tmp_path, monk
 
 def test_a_file_of_the_same_name_wins_over_a_shipped_policy(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert find_policy("paper-5v2o").parent.name == "policies"
-    (tmp_path / "paper-5v2o").write_bytes(b"mine")
-    assert find_policy("paper-5v2o").read_bytes() == b"mine"
-    with pytest.raises(PolicyError, match="nor one of .*paper-5v2o"):
-        find_policy("paper-9v9o")
+    assert find_policy("ddpg-5v2o").parent.name == "policies"
+    (tmp_path / "ddpg-5v2o").write_bytes(b"mine")
+    assert find_policy("ddpg-5v2o").read_bytes() == b"mine"
+    with pytest.raises(PolicyError, match="nor one of .*ddpg-5v2o"):
+        find_policy("ddpg-9v9o")

@@ -10,7 +10,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
 from sb3_flock import FlockCNN, NeighborInclusiveReward, Scenario, flatten, make_vec_env
-from sb3_flock.rl.callbacks import FadingNoise, FlockMetrics
+from sb3_flock.rl.callbacks import FlockMetrics, LinearNoiseDecay
 from sb3_flock.settings import SettingsError
 
 CROWDED = Scenario(n_vehicles=4, n_obstacles=1, arena=0.2, obstacle_arena=0.4, neighbor_separation=0.02, max_cycles=5)
@@ -181,6 +181,8 @@ def test_a_share_outside_0_1_is_refused(lambda_):
 
 def test_noise_fades_linearly():
     env = make_vec_env(CROWDED, n_flocks=1, seed=1)
-    model = learn(env, FadingNoise(0.4, 0.2), 10, FlockCNN, action_noise=NormalActionNoise(np.zeros(2), np.full(2, 9.0)))
+    model = learn(
+        env, LinearNoiseDecay(0.4, 0.2), 10, FlockCNN, action_noise=NormalActionNoise(np.zeros(2), np.full(2, 9.0))
+    )
     # Ten vector steps; the last round starts with one tenth of the way left.
     np.testing.assert_allclose(model.action_noise.noises[3]._sigma, 0.22)

@@ -7,13 +7,7 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_flock import CompactReplayBuffer, FlockCNN, FlockDDPG, FlockPolicy, make_vec_env
 from sb3_flock.settings import SettingsError
-
-
-class PlainCNN(FlockCNN):
-    """The same network in torch's own convolutions."""
-
-    def forward(self, observations):
-        return self.dense(self.cnn(observations))
+from tests.helpers import PlainCNN
 
 
 def model(algorithm, extractor, fused, **kwargs):
@@ -61,10 +55,10 @@ def test_fifty_updates_end_where_stock_ddpg_with_plain_convolutions_ends(n_criti
         assert lean.logger.name_to_value[name] == pytest.approx(stock.logger.name_to_value[name], rel=1e-3)
 
 
-@pytest.mark.parametrize("guidance", [0.0, 30.0])
-def test_guidance_draws_the_actor_to_what_is_advised(guidance):
+@pytest.mark.parametrize("bc_coef", [0.0, 30.0])
+def test_guidance_draws_the_actor_to_what_is_advised(bc_coef):
     lean, rng = model(FlockDDPG, FlockCNN, True), np.random.default_rng(0)
-    lean.guidance, advised = guidance, np.array([0.5, -0.25])
+    lean.bc_coef, advised = bc_coef, np.array([0.5, -0.25])
     envs, shape = lean.n_envs, lean.observation_space.shape
     lean.replay_buffer = CompactReplayBuffer(1200, lean.observation_space, lean.action_space, "cpu", envs, advice=True)
     for _ in range(100):
@@ -76,17 +70,17 @@ def test_guidance_draws_the_actor_to_what_is_advised(guidance):
     observations = lean.replay_buffer.sample(200).observations
     actions = lean.actor(observations).detach().numpy()
     gap = np.square(actions - advised).mean()
-    if guidance:
+    if bc_coef:
         assert gap < 0.01
-        assert lean.logger.name_to_value["train/advice_gap"] < 0.1
+        assert lean.logger.name_to_value["train/bc_loss"] < 0.1
     else:
         assert gap > 0.1
-        assert "train/advice_gap" not in lean.logger.name_to_value
+        assert "train/bc_loss" not in lean.logger.name_to_value
 
 
 def test_guidance_without_advice_is_refused_in_one_line():
-    with pytest.raises(SettingsError, match="guidance = 2.0: needs a CompactReplayBuffer with advice=True, or be 0"):
-        FlockDDPG(FlockPolicy, make_vec_env(n_flocks=1), guidance=2.0, device="cpu")
+    with pytest.raises(SettingsError, match="bc_coef = 2.0: needs a CompactReplayBuffer with advice=True, or be 0"):
+        FlockDDPG(FlockPolicy, make_vec_env(n_flocks=1), bc_coef=2.0, device="cpu")
 
 
 def test_another_extractor_is_refused_in_one_line():

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from sb3_flock.sim import Scenario, observe, sense
 from sb3_flock.sim.sensing import distance_blocks
-from tests.sim.conftest import place
+from tests.helpers import place
 
 SCENARIO = Scenario(n_vehicles=4, n_obstacles=2)
 seeds = st.integers(0, 2**31)
@@ -141,5 +141,5 @@ def test_compiled_and_plain_paint_the_same(seed, n_anchors, anchor_width, radius
         n_anchors=n_anchors, anchor_width=anchor_width, neighbor_radius=radius, obstacle_radius=radius, goal_radius=radius
     )
     sensing = sense(random_world(seed, scenario))
-    compiled, plain = observe(sensing, scenario), observe(sensing, scenario, compile_it=False)
+    compiled, plain = observe(sensing, scenario), observe(sensing, scenario, use_numba=False)
     np.testing.assert_allclose(compiled, plain, rtol=1e-5, atol=1e-20)

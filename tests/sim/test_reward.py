@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sb3_flock.sim import Scenario, mix_rewards, own_reward, reward_terms, sense
-from tests.sim.conftest import place
+from tests.helpers import place
 
 WEIGHTS = {
     "epsilon": 0.5,

@@ -86,9 +86,9 @@ def test_distances_come_in_blocks_and_the_nearest_is_the_smallest(monkeypatch):
     np.testing.assert_allclose(np.concatenate([block for _, block in blocks], axis=1), expected)
     np.testing.assert_allclose(nearest(positions, bodies), expected.min(-1))
     apart = np.linalg.norm(positions[:, None] - positions[:, :, None], axis=-1) + 9 * np.eye(7)
-    np.testing.assert_allclose(nearest(positions, positions, others=True), apart.min(-1))
+    np.testing.assert_allclose(nearest(positions, positions, exclude_self=True), apart.min(-1))
     assert np.isinf(nearest(positions, np.empty((2, 0, 2)))).all()
-    assert np.isinf(nearest(positions[:, :1], positions[:, :1], others=True)).all()
+    assert np.isinf(nearest(positions[:, :1], positions[:, :1], exclude_self=True)).all()
 
 
 @pytest.mark.parametrize(

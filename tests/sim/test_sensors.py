@@ -2,13 +2,13 @@ import numpy as np
 import pytest
 
 from sb3_flock import flocking_v0
+from sb3_flock.controllers import make_controller
 from sb3_flock.evaluation import evaluate
-from sb3_flock.evaluation.controllers import make_controller
-from sb3_flock.evaluation.episodes import fly
+from sb3_flock.evaluation.rollout import fly
 from sb3_flock.settings import SettingsError
 from sb3_flock.sim import Scenario, World, episode_rng, sense
 from sb3_flock.sim.sensors import SensorErrors
-from tests.sim.conftest import assert_another_goes_on_alike
+from tests.helpers import assert_copy_continues_alike
 
 CROWD = Scenario(n_vehicles=12, n_obstacles=6, arena=0.35, obstacle_arena=0.6)
 
@@ -93,7 +93,7 @@ def test_an_env_shows_what_is_measured_and_goes_on_from_its_state():
     _, exact_rewards, *_, exact_infos = exact.step(actions)
     assert rewards == exact_rewards
     assert all(infos[agent]["metrics"] == exact_infos[agent]["metrics"] for agent in env.agents)
-    assert_another_goes_on_alike(env, actions, steps=4)
+    assert_copy_continues_alike(env, actions, steps=4)
 
 
 def test_sense_is_always_exact():

@@ -23,7 +23,7 @@ def random_scenario(rng):
         n_obstacles=int(rng.integers(0, 10)),
         max_cycles=int(rng.integers(1, 60)),
         time_step=time_step,
-        look_back=time_step * int(rng.integers(0, 4)),
+        motion_lag=time_step * int(rng.integers(0, 4)),
         max_speed=unit * 10 ** rng.uniform(-3, 1),
         max_turn_rate=10 ** rng.uniform(-2, 2),
         obstacle_max_speed=unit * rng.uniform(0, 1),

@@ -39,7 +39,7 @@ def test_where_the_waypoint_will_be_is_where_it_goes(scenario, route):
     world.reset([np.random.default_rng(seed) for seed in range(3)])
     world.step(np.zeros((3, scenario.n_vehicles, 2)))
     steps = np.array([[0, 5, 30, 40], [0, 5, 30, 40], [40, 0, 5, 30]])
-    told = world.waypoints_after(steps)
+    told = world.predict_waypoints(steps)
     seen = [world.waypoints]
     for _ in range(40):
         world.step(np.zeros((3, scenario.n_vehicles, 2)))
@@ -71,7 +71,7 @@ def test_crossing_obstacles_go_where_they_are_expected():
     scenario = Scenario(n_vehicles=2, n_obstacles=3, obstacle_motion="crossing")
     world, steps = World(scenario, 2), np.array([1, 4, 20])
     world.reset([episode_rng(0, episode) for episode in range(2)])
-    told = world.obstacles_after(steps)
+    told = world.predict_obstacles(steps)
     for step in range(1, 21):
         world.step(np.zeros((2, 2, 2)))
         if step in steps:
@@ -118,7 +118,7 @@ def test_starts_lie_in_their_squares_and_keep_their_separations(seed, n_vehicles
     assert np.abs(world.positions).max() <= 1.0
     assert np.abs(world.waypoints).max() <= 1.0
     assert np.abs(world.obstacle_positions).max(initial=0.0) <= 0.7
-    assert nearest(world.positions, world.positions, others=True).min() >= scenario.neighbor_separation
+    assert nearest(world.positions, world.positions, exclude_self=True).min() >= scenario.neighbor_separation
     assert nearest(world.positions, world.obstacle_positions).min() >= scenario.obstacle_separation
 
 

@@ -50,16 +50,16 @@ def test_the_base_may_be_a_file_beside_it_and_is_kept_whole(tmp_path):
     (tmp_path / "sweep.yaml").write_text("base: mine.yaml\ngrid: {seed: [0, 1]}\nresources: {cpus: 2}\n")
     config = load_sweep(tmp_path / "sweep.yaml", {"gamma": 0.5})
     trained = config.training(config.points()[1])
-    assert (trained.total_timesteps, trained.scenario.n_vehicles, trained.learner.gamma) == (77, 6, 0.5)
+    assert (trained.total_timesteps, trained.scenario.n_vehicles, trained.algorithm.gamma) == (77, 6, 0.5)
     assert (trained.seed, trained.torch_threads) == (1, 2)
 
 
 def test_a_searchs_ends_and_choices_are_all_tried_before_it_starts():
     config = read("search: {batch_size: {low: 8, high: 64}, gamma: [0.9, 0.99]}")
-    assert config.search["learner.batch_size"] == Range(low=8, high=64)
+    assert config.search["algorithm.batch_size"] == Range(low=8, high=64)
     points = config.points()
-    assert {point["learner.batch_size"] for point in points} == {8, 64}
-    assert {point["learner.gamma"] for point in points} == {0.9, 0.99}
+    assert {point["algorithm.batch_size"] for point in points} == {8, 64}
+    assert {point["algorithm.gamma"] for point in points} == {0.9, 0.99}
 
 
 def test_a_flight_is_the_policys_scenario_with_the_points_changes():
@@ -83,7 +83,7 @@ def test_a_flight_is_the_policys_scenario_with_the_points_changes():
         ("grid: {output_dir: [a, b]}", "output_dir: a sweep sets it by itself"),
         ("base: [1]\ngrid: {seed: [0]}", "base = [1]: a config's file or a mapping of its fields is needed"),
         ("base: nowhere.yaml\ngrid: {seed: [0]}", "config nowhere.yaml: No such file or directory"),
-        ("grid: {seed: [0]}\ntasks: [gamma]", "tasks = learner.gamma: a field of the grid is needed"),
+        ("grid: {seed: [0]}\ntasks: [gamma]", "tasks = algorithm.gamma: a field of the grid is needed"),
         ("grid: {seed: [0]}\nmetric: speed", "metric = 'speed': score or one of"),
         ("grid: {seed: [0]}\ntrails: 3", "trails is not a parameter of SweepConfig; did you mean trials?"),
         ("search: {gamma: {low: 0.9, high: 0.1}}", "low = 0.9: at most high = 0.1 is needed"),

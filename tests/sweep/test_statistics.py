@@ -9,7 +9,7 @@ import pytest
 from sb3_flock.sweep.config import load_sweep
 from sb3_flock.sweep.run import Trial
 from sb3_flock.sweep.statistics import rank, ranking_csv, ranking_figure, ranking_table
-from tests.rl.test_training import quiet
+from tests.helpers import quiet
 
 
 def trials_of(config, values):

@@ -12,12 +12,12 @@ import torch as th
 
 from sb3_flock import load_policy, train
 from sb3_flock.sweep.config import load_sweep
-from tests.rl.test_training import TINY, quiet
+from tests.helpers import TINY, quiet
 
 pytest.importorskip("ray")
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="kills as POSIX does")
 
-SMALL = {**TINY, "test_episodes": 3}
+SMALL = {**TINY, "n_test_episodes": 3}
 LONG = {**SMALL, "total_timesteps": 4_000, "save_freq": 500, "eval_freq": 2_000, "buffer_size": 2_000}
 
 
@@ -81,7 +81,7 @@ def test_a_grid_leaves_run_folders_a_table_and_a_ranking_and_survives_what_diver
     code, output, errors = Sweep(file, "--out", f"local://{out}", "--set", "total_timesteps=420").end()
     assert code == 0, errors
     rows = results(out)
-    assert {(row["learner.learning_rate"], row["seed"], row["status"]) for row in rows} == {
+    assert {(row["algorithm.learning_rate"], row["seed"], row["status"]) for row in rows} == {
         *(("0.0005", seed, "done") for seed in "01"),
         *(("1000000.0", seed, "diverged") for seed in "01"),
     }
@@ -161,8 +161,8 @@ def test_a_search_ends_with_its_best(tmp_path):
     assert code == 0, errors
     rows = results(out)
     assert len(rows) == 2
-    assert all(8 <= int(row["learner.batch_size"]) <= 32 for row in rows)
-    assert len({row["learner.learning_rate"] for row in rows}) == 2
+    assert all(8 <= int(row["algorithm.batch_size"]) <= 32 for row in rows)
+    assert len({row["algorithm.learning_rate"] for row in rows}) == 2
     assert "learning_rate" in output
 
 
@@ -170,9 +170,9 @@ def test_a_policy_flies_over_a_grid_as_it_does_in_evaluate(tmp_path):
     from sb3_flock import evaluate
 
     file, out = sweep_file(tmp_path, "grid: {n_vehicles: [1, 4], seed: [3]}\n"), tmp_path / "out"
-    code, _, errors = Sweep(file, "--evaluate", "paper-3v1o", "--episodes", "5", "--out", out).end()
+    code, _, errors = Sweep(file, "--evaluate", "ddpg-3v1o", "--episodes", "5", "--out", out).end()
     assert code == 0, errors
-    policy = load_policy("paper-3v1o")
+    policy = load_policy("ddpg-3v1o")
     for row in results(out):
         expected = evaluate(policy, policy.scenario.replace(n_vehicles=int(row["scenario.n_vehicles"])), 5, 3)
         assert float(row["tracking_error"]) == pytest.approx(expected["tracking_error"].mean, rel=1e-12)
@@ -189,9 +189,9 @@ def test_a_policy_flies_over_a_grid_as_it_does_in_evaluate(tmp_path):
         (["--evaluate", "nobody"], "nobody: no such file or run folder"),
         (
             ["--evaluate", "general", "--set", "n_anchors=7"],
-            "general.zip: it sees tensors of (6, 11, 11), but the scenario's (n_anchors = 7, look_back = 0.2) are of (6, 7, 7)",
+            "general.zip: it sees tensors of (6, 11, 11), but the scenario's (n_anchors = 7, motion_lag = 0.2) are of (6, 7, 7)",
         ),
-        (["--evaluate", "general", "--set", "gamma=0.5"], "learner.gamma does not tell on a flight"),
+        (["--evaluate", "general", "--set", "gamma=0.5"], "algorithm.gamma does not tell on a flight"),
         (["--episodes", "3"], "--episodes 3: only with --evaluate"),
         (["--resume", "x"], "a FILE or --resume DIR is needed, and not both"),
     ],

@@ -89,14 +89,14 @@ def train_benchmarl(algorithm: str, args: argparse.Namespace, stopwatch: Stopwat
             stopwatch.check(self.experiment.total_frames * args.vehicles, self.updates)
 
     # BenchMARL counts in frames; a frame is a step of one flock and holds a transition of every agent in it. A round
-    # collects ROUND vector steps, ROUND * flocks frames, and updates `update_ratio` times for each of their transitions.
+    # collects ROUND vector steps, ROUND * flocks frames, and updates `utd_ratio` times for each of their transitions.
     # A batch has as many frames as hold `batch` transitions.
     frames_per_round = ROUND * args.flocks
     frames_per_batch = -(-args.batch // args.vehicles)
     config = ExperimentConfig.get_from_yaml()
     config.off_policy_n_envs_per_worker = args.flocks
     config.off_policy_collected_frames_per_batch = frames_per_round
-    config.off_policy_n_optimizer_steps = max(1, round(args.update_ratio * frames_per_round * args.vehicles))
+    config.off_policy_n_optimizer_steps = max(1, round(args.utd_ratio * frames_per_round * args.vehicles))
     config.off_policy_train_batch_size = frames_per_batch
     config.off_policy_memory_size = BUFFER // args.vehicles
     config.max_n_frames = 10**9
@@ -162,7 +162,7 @@ def train_sbx(args: argparse.Namespace, stopwatch: Stopwatch) -> dict[str, Any]:
         learning_starts=WARM_UP // 2,
         batch_size=args.batch,
         train_freq=1,
-        gradient_steps=max(1, round(args.update_ratio * env.num_envs)),  # a vector step has a transition of every slot
+        gradient_steps=max(1, round(args.utd_ratio * env.num_envs)),  # a vector step has a transition of every slot
         action_noise=NormalActionNoise(np.zeros(2), np.full(2, 0.3)),
         policy_kwargs={"net_arch": NET_ARCH},
         seed=0,

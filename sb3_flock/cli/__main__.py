@@ -1,0 +1,7 @@
+"""``python -m sb3_flock.cli``."""
+
+import sys
+
+from sb3_flock.cli import main
+
+sys.exit(main())

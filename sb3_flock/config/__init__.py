@@ -1,0 +1,1 @@
+"""The composition of the parts' settings into the config of a whole training."""

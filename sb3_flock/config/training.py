@@ -1,0 +1,144 @@
+"""TrainingConfig: everything that decides a training. Its descriptions are the ``--help`` and the YAML comments."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated
+
+from pydantic import BeforeValidator, Field, model_validator
+
+from sb3_flock.controllers import EXPERTS
+from sb3_flock.controllers.mpc import MPCConfig
+from sb3_flock.rl.registry import ModelSettings
+from sb3_flock.rl.settings import Count, Width
+from sb3_flock.settings import NotNegative, Positive, Settings, suggest
+from sb3_flock.sim import Scenario
+from sb3_flock.sim.dynamics import MAX_BODIES
+
+Sizes = Annotated[tuple[Width, ...], BeforeValidator(lambda value: (value,) if isinstance(value, int) else value)]
+"""One or several; a number alone is one."""
+
+
+class TrainEnvConfig(Settings):
+    """How the training env differs from the task. The task itself, on which policies are evaluated, never changes.
+
+    With the paper's random walk an obstacle seldom meets the flock, and a policy that keeps exactly the minimum separation
+    violates it at the slightest error: the training env is harder than the task. In a large flock every vehicle's exploration
+    disturbs all others, and policies learn packs that are loose enough to tolerate it; in a small one too few encounters
+    happen: the default is a flock of four. The effect of one action over a tenth of a second is small beside the noise of the
+    value estimates: the training env's time step is longer, and ``algorithm.gamma`` counts these longer steps. A policy that
+    explores seldom visits dense packs at rest, and learns to avoid them: an expert demonstrates them.
+    """
+
+    flock_sizes: Sizes | None = Field(
+        (4,),
+        min_length=1,
+        max_length=16,
+        description="vehicles per flock, one or several sizes; null: as in the task (paper: null)",
+    )
+    extra_obstacles: int = Field(1, ge=0, le=MAX_BODIES, description="obstacles added if the task has any (paper: 0)")
+    obstacle_arena_scale: Positive = Field(
+        0.5, description="factor on the obstacles' square, unless obstacle_starts is set (paper: 1)"
+    )
+    time_step_scale: Positive = Field(2.0, description="factor on the sampling period (paper: 1)")
+    separation_scale: float = Field(1.06, ge=1, le=1e6, description="factor on the minimum separations (paper: 1)")
+    obstacle_separation_scale: float | None = Field(
+        None, ge=1, le=1e6, description="the same for obstacles; null: separation_scale (paper: 1)"
+    )
+    expert: str | None = Field(
+        None,
+        description="expert to learn from: mpc (plans for the whole flock from the full state), orca, olfati-saber; "
+        "null: none (paper: null)",
+    )
+    expert_fraction: float = Field(
+        0.25, ge=0, le=1, description="share of the episodes that the expert drives (DAgger's beta; paper: 0)"
+    )
+    expert_noise_std: NotNegative = Field(
+        0.1, description="standard deviation of the noise on the expert's actions [half the action range]"
+    )
+    mpc: MPCConfig = Field(default_factory=MPCConfig, description="the cost and the optimizer of the expert mpc")
+
+    @model_validator(mode="after")
+    def _expert_is_known(self) -> TrainEnvConfig:
+        if self.expert is not None and self.expert not in EXPERTS:
+            raise ValueError(
+                f"expert = {self.expert!r}: one of {', '.join(EXPERTS)} or null is needed{suggest(self.expert, EXPERTS)}"
+            )
+        return self
+
+
+class TaskConfig(Settings):
+    """The task, and how the training env differs from it."""
+
+    scenario: Scenario = Field(default_factory=Scenario, description="the task, on which policies are evaluated")
+    train_env: TrainEnvConfig = Field(
+        default_factory=TrainEnvConfig, description="how the training env differs from the task"
+    )
+
+    @model_validator(mode="after")
+    def _lag_fits_the_training_env(self) -> TaskConfig:
+        steps = self.scenario.motion_lag_steps / self.train_env.time_step_scale
+        if not math.isclose(steps, round(steps), rel_tol=1e-6) or (self.scenario.motion_lag and steps < 0.5):
+            step = f"{self.scenario.time_step * self.train_env.time_step_scale:g} s, the training env's sampling period"
+            raise ValueError(f"motion_lag = {self.scenario.motion_lag}: input should be a multiple of {step}")
+        return self
+
+    def training_scenarios(self) -> list[Scenario]:
+        """The scenarios of the training env: ``scenario`` changed as ``train_env`` says, one for each flock size."""
+        scenario, train_env = self.scenario, self.train_env
+        changed = scenario.replace(
+            time_step=scenario.time_step * train_env.time_step_scale,
+            max_cycles=max(1, round(scenario.max_cycles / train_env.time_step_scale)),
+            n_obstacles=scenario.n_obstacles + (train_env.extra_obstacles if scenario.n_obstacles else 0),
+            obstacle_arena=scenario.obstacle_half_side
+            * (1.0 if scenario.obstacle_starts else train_env.obstacle_arena_scale),
+            neighbor_separation=min(scenario.neighbor_separation * train_env.separation_scale, scenario.link_range),
+            obstacle_separation=min(
+                scenario.obstacle_separation * (train_env.obstacle_separation_scale or train_env.separation_scale),
+                scenario.detection_range,
+            ),
+        )
+        return [changed.replace(n_vehicles=size) for size in train_env.flock_sizes or (scenario.n_vehicles,)]
+
+
+class TrainingConfig(ModelSettings, TaskConfig):
+    """A training: the task, the algorithm, the networks and the bookkeeping.
+
+    Totals and frequencies count transitions. One transition is one step of one vehicle: a vector step of ``n_flocks`` flocks
+    counts ``n_flocks`` times the flock size.
+
+    :raises SettingsError: one line naming the parameter, its value and what is accepted
+    """
+
+    total_timesteps: int = Field(300_000, ge=1, le=10**12, description="transitions to train for")
+    n_flocks: Width = Field(32, description="flocks in the training env, of each flock size")
+    num_cpus: int = Field(
+        0, ge=0, le=1024, description="SuperSuit worker processes; 0: simulate in the training process, which is faster"
+    )
+    torch_threads: int = Field(
+        0,
+        ge=0,
+        le=1024,
+        description="torch threads; 0: one for batches under 1024, where more are no faster, else one per core",
+    )
+
+    eval_freq: Count = Field(10_000, description="transitions between evaluations; 0: none")
+    n_eval_episodes: int = Field(100, ge=1, le=1_000_000, description="episodes of an evaluation, the same ones every time")
+    n_test_episodes: int = Field(
+        1000, ge=1, le=1_000_000, description="episodes of the table that `sb3-flock train` prints at the end"
+    )
+    save_freq: Count = Field(25_000, description="transitions between checkpoints; 0: none")
+    keep_checkpoints: int = Field(
+        2, ge=1, le=1_000_000, description="number of newest checkpoints to keep; `train --resume` continues from the newest"
+    )
+    init_from: str | None = Field(None, description="policy (zip or run folder) with the initial weights; null: random")
+    output_dir: str = Field("runs", description="folder in which run folders are created")
+
+    @model_validator(mode="after")
+    def _bc_has_an_expert(self) -> TrainingConfig:
+        # The velocity that Olfati-Saber's controller integrates is defined only where the controller drives.
+        if self.algorithm.bc_coef and self.train_env.expert in (None, "olfati-saber"):
+            raise ValueError(
+                f"algorithm.bc_coef = {self.algorithm.bc_coef}: input should be 0 without train_env.expert mpc or orca"
+            )
+        return self

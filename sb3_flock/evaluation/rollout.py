@@ -1,0 +1,113 @@
+"""Simulating many episodes at once with any controller, and evaluating them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_flock.controllers import Controller
+from sb3_flock.controllers.policy import PolicyController
+from sb3_flock.evaluation.metrics import EpisodeMetrics, Metric, summarize
+from sb3_flock.serialization.load import LoadedPolicy
+from sb3_flock.settings import SettingsError, check_integer
+from sb3_flock.sim import Scenario, Sensing, World, episode_rng, own_reward, reward_terms
+
+BATCH = 250
+"""Episodes simulated at once; it bounds the memory and does not change the results."""
+
+
+def rollout(
+    controller: Controller, scenario: Scenario, episodes: int, seed: int, batch: int = BATCH
+) -> dict[str, NDArray[np.float64]]:
+    """Simulate episodes 0 ... ``episodes - 1`` of a seed.
+
+    :param batch: episodes simulated at once; it does not change the results
+    :return: each metric's value for each episode, ``(episodes,)``
+    :raises SettingsError: for counts that are not accepted
+    """
+    for name, value, least in (("episodes", episodes, 1), ("seed", seed, 0), ("batch", batch, 1)):
+        check_integer(name, value, least)
+    results = []
+    for start in range(0, episodes, batch):
+        rngs = [episode_rng(seed, episode) for episode in range(start, min(start + batch, episodes))]
+        results.append(rollout_batch(lambda world: controller, scenario, rngs))
+    return {name: np.concatenate([result[name] for result in results]) for name in results[0]}
+
+
+def rollout_batch(
+    make_controller: Callable[[World], Controller], scenario: Scenario, rngs: Sequence[np.random.Generator]
+) -> dict[str, NDArray[np.float64]]:
+    """Simulate a batch of episodes in lockstep.
+
+    :param make_controller: makes the controller of a world; a privileged one may read the whole world
+    :param rngs: one generator per episode
+    :return: each metric's value for each episode, ``(episodes,)``
+    """
+    metrics = EpisodeMetrics(scenario, len(rngs))
+    world, sensing, controller = _start(make_controller, scenario, rngs)
+    for _ in range(scenario.max_cycles):
+        sensing, clipped = world.step(controller.act(world.sensors.measure(sensing), scenario))
+        metrics.update(world, sensing, own_reward(reward_terms(sensing, clipped, scenario.reward, scenario)))
+    return metrics.result()
+
+
+def iter_rollout(policy: Any, scenario: Scenario, seed: int = 0, episode: int = 0) -> Iterator[World]:
+    """Simulate one episode, the same as :func:`rollout` does under this number.
+
+    :param policy: as in :func:`evaluate`
+    :return: the world at the start and after each step, always the same object
+    """
+    check_integer("seed", seed, 0)
+    check_integer("episode", episode, 0)
+    controller = as_controller(policy, scenario)
+    world, sensing, _ = _start(lambda world: controller, scenario, [episode_rng(seed, episode)])
+    yield world
+    for _ in range(scenario.max_cycles):
+        sensing, _ = world.step(controller.act(world.sensors.measure(sensing), scenario))
+        yield world
+
+
+def _start(
+    make_controller: Callable[[World], Controller], scenario: Scenario, rngs: Sequence[np.random.Generator]
+) -> tuple[World, Sensing, Controller]:
+    """A world at the start of its episodes, what is sensed there, and its controller, reset."""
+    world = World(scenario, len(rngs))
+    sensing, controller = world.reset(rngs), make_controller(world)
+    controller.reset(rngs, scenario)
+    return world, sensing, controller
+
+
+def as_controller(policy: Any, scenario: Scenario) -> Controller:
+    """A controller or anything with SB3's ``predict`` as a :class:`Controller`; a loaded policy is checked against the scenario.
+
+    :raises PolicyError: if a loaded policy's observations differ in shape; it warns where they have another meaning
+    """
+    if isinstance(policy, Controller):
+        return policy
+    if isinstance(policy, LoadedPolicy):
+        policy.check(scenario)
+    if not callable(getattr(policy, "predict", None)):
+        raise SettingsError(f"policy = {type(policy).__name__}: a Controller, or an object with SB3's predict, is needed")
+    return PolicyController(policy)
+
+
+def evaluate(
+    policy: Any, scenario: Scenario | None = None, episodes: int = 1000, seed: int = 0, batch: int = BATCH
+) -> dict[str, Metric]:
+    """Evaluate a policy or any other controller.
+
+    :param policy: a :class:`Controller`, or anything with SB3's ``predict``
+    :param scenario: the task; the default is the one a loaded policy was trained for
+    :param episodes: number of episodes
+    :param seed: episode e draws from ``SeedSequence([seed, e])``
+    :return: every metric of :data:`~sb3_flock.evaluation.METRICS` by name
+    :raises SettingsError: for counts that are not accepted, or without a scenario
+    :raises PolicyError: if a loaded policy's observations differ in shape; it warns where they have another meaning
+    """
+    scenario = scenario or getattr(policy, "scenario", None)
+    if scenario is None:
+        raise SettingsError("scenario = None: the policy carries none, so one is needed")
+    return summarize(rollout(as_controller(policy, scenario), scenario, episodes, seed, batch))

@@ -1,0 +1,129 @@
+"""Every earlier format of our files, read into the present one.
+
+Zips, checkpoints and whole configs carry a format number. Format 1 flattened the features channel by channel, format 2 anchor
+by anchor; format 3 renamed fields, values and modules (:mod:`sb3_flock._renamed`).
+The module is importable without torch.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+from sb3_flock._renamed import rename_fields
+from sb3_flock.settings import Settings, SettingsError, format_value, group_of
+
+FORMAT = 3
+"""The format that this version writes."""
+
+MEMBER = "flock.json"
+"""The JSON member of our zips: format, config, number of transitions and versions."""
+
+
+def check_format(number: Any) -> int:
+    """The number of a format that this version reads.
+
+    :raises SettingsError: for any other
+    """
+    if isinstance(number, int) and 1 <= number <= FORMAT:
+        return number
+    raise SettingsError(f"format = {format_value(number)}: this version reads formats 1 to {FORMAT}")
+
+
+def migrate_config(
+    settings: type[Settings], values: Mapping[str, Any], number: int
+) -> tuple[dict[str, Any], list[tuple[str, str]]]:
+    """A config's values in the present format, and what was renamed as (old, new) pairs.
+
+    :param settings: the class that the values are of
+    :param values: a mapping of fields, whole or in part
+    :param number: the format of the values; with the present one old names are read all the same
+    """
+    current, renamed = _rename(settings, _without_max_vehicles(values), "")
+    if number < 3 or renamed:
+        _drop_idle_options(current)
+    return current, renamed
+
+
+def _rename(
+    settings: type[Settings], values: Mapping[str, Any], prefix: str
+) -> tuple[dict[str, Any], list[tuple[str, str]]]:
+    # A class that inherits its fields reads the old names of its own class name alone.
+    current, names = rename_fields(settings.__name__, values)
+    renamed = [(prefix + old, prefix + new) for old, new in names]
+    for name, value in current.items():
+        field = settings.model_fields.get(name) if isinstance(name, str) else None
+        group = None if field is None else group_of(field.annotation)
+        if group is not None and isinstance(value, Mapping):
+            current[name], inner = _rename(group, value, f"{prefix}{name}.")
+            renamed += inner
+    return current, renamed
+
+
+def _without_max_vehicles(values: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The first configs bounded the flock size, had no time step of their own, and scaled no separation to obstacles."""
+    practice = values.get("practice")
+    if not isinstance(practice, Mapping) or "max_vehicles" not in practice:
+        return values
+    n_vehicles = dict(values.get("scenario", {})).get("n_vehicles", 3)
+    others = {name: value for name, value in practice.items() if name != "max_vehicles"}
+    then = {"time_step_ratio": 1.0, "obstacle_separation_ratio": 1.0}
+    sizes = (min(n_vehicles, practice["max_vehicles"]),)
+    learner = {"mirror": False, **values.get("learner", {})}
+    return {**values, "practice": {**then, **others, "vehicles": sizes}, "learner": learner}
+
+
+def _drop_idle_options(values: dict[str, Any]) -> None:
+    """Earlier formats wrote options that did not apply to the algorithm, and ignored them; they are refused now."""
+    algo = values.get("algo", "ddpg")
+    algorithm, network = values.get("algorithm"), values.get("network")
+    if isinstance(algorithm, dict) and (algo == "ddpg-sb3" or algorithm.get("n_steps", 1) != 1):
+        algorithm.pop("mirror_augmentation", None)
+    if isinstance(network, dict) and algo == "sac":
+        network.pop("action_bound", None)
+
+
+def migrate_weights(weights: Mapping[str, Any], number: int) -> dict[str, Any]:
+    """The tensors of a policy in the present format.
+
+    Up to format 1 the dense layer behind the convolutions took features flattened channel by channel.
+    """
+    if number > 1:
+        return dict(weights)
+    current = dict(weights)
+    for name, tensor in weights.items():
+        if not name.endswith("dense.0.weight"):
+            continue
+        convolutions = name.removesuffix("dense.0.weight") + "cnn."
+        layers = [key for key in weights if re.fullmatch(re.escape(convolutions) + r"\d+\.weight", key)]
+        features = len(weights[max(layers, key=lambda key: int(key.rsplit(".", 2)[1]))])
+        by_channel = tensor.view(len(tensor), features, -1)
+        current[name] = by_channel.permute(0, 2, 1).reshape(len(tensor), -1).contiguous()
+    return current
+
+
+_STATE_KEYS = {
+    "looks": "history",
+    "moved": "ego_motion",
+    "earlier": "previous",
+    "taught": "expert",
+    "advice": "expert_actions",
+    "planned": "next_actions",
+    "wanted": "velocities",
+    "surroundings": "runtime_info",
+}
+"""Old to new keys of a checkpoint's state."""
+
+
+def migrate_state(state: Any, number: int) -> Any:
+    """The state of a training in a checkpoint, in the present format."""
+    if number >= 3:
+        return state
+    if isinstance(state, Mapping):
+        current = {_STATE_KEYS.get(key, key): migrate_state(value, number) for key, value in state.items()}
+        if "expert" in current and isinstance(current["expert"], dict):
+            # The first files with an expert did not store its action apart from the noisy one.
+            current["expert"].setdefault("expert_actions", current["expert"].get("next_actions"))
+        return current
+    return [migrate_state(value, number) for value in state] if isinstance(state, list) else state

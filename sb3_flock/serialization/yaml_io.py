@@ -1,0 +1,133 @@
+"""Reading and writing configs: YAML with a comment on every key, and ``key=value`` overrides.
+
+A file may hold any part of a config: fields that it leaves out keep their defaults.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+
+from sb3_flock._renamed import warn_renamed
+from sb3_flock.serialization.migrate import FORMAT, check_format, migrate_config
+from sb3_flock.settings import Settings, SettingsError, format_value, group_of, leaf_paths, resolve_path, suggest
+
+_Settings = TypeVar("_Settings", bound=Settings)
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML's safe loader, which also reads 1e-3 as a number; in YAML 1.1 it is a string."""
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"^[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]+$"), list("-+.0123456789")
+)
+
+
+def load_config(
+    settings: type[_Settings],
+    path: str | Path | None = None,
+    overrides: Mapping[str, Any] | None = None,
+    base: _Settings | None = None,
+) -> _Settings:
+    """A config from a YAML file, from another config or from the defaults, with overrides applied.
+
+    :param path: YAML file; keys it leaves out keep their defaults
+    :param base: the config to start from, instead of a file
+    :param overrides: values by parameter name, leading groups may be left out (``reward.lambda_``)
+    :raises SettingsError: one line for a file or a value that is not accepted
+    """
+    values: dict[str, Any] = {} if base is None else base.model_dump()
+    if path is not None:
+        values = _migrated(settings, read_yaml(Path(path)), Path(path))
+    _check_groups(settings, values, "")
+    for key, value in (overrides or {}).items():
+        *groups, name = resolve_path(settings, key)
+        level = values
+        for group in groups:
+            level = level.setdefault(group, {})
+        level[name] = value
+    return settings(**values)
+
+
+def parse_overrides(assignments: Iterable[str]) -> dict[str, Any]:
+    """``["reward.lambda_=0.5", ...]`` as a mapping; values are read as YAML.
+
+    :raises SettingsError: for an assignment without ``=`` or a value that is not YAML
+    """
+    overrides = {}
+    for assignment in assignments:
+        key, equals, text = assignment.partition("=")
+        if not equals or not key:
+            raise SettingsError(f"{assignment}: KEY=VALUE is needed, such as reward.lambda_=0.5")
+        try:
+            overrides[key] = yaml.load(text, _Loader)
+        except (yaml.YAMLError, ValueError):
+            raise SettingsError(f"{assignment}: the value is not YAML") from None
+    return overrides
+
+
+def to_yaml(config: Settings) -> str:
+    """The whole config as YAML with its format number, every key commented with its description."""
+    return "\n".join([f"format: {FORMAT} # of this file", *_lines(config, indent="")]) + "\n"
+
+
+def _lines(config: Settings, indent: str) -> Iterable[str]:
+    for name, field in type(config).model_fields.items():
+        value = getattr(config, name)
+        if isinstance(value, Settings):
+            yield f"{indent}{name}: # {field.description}"
+            yield from _lines(value, indent + "  ")
+        else:
+            plain = config.model_dump(mode="json", include={name})[name]
+            text = yaml.safe_dump(plain, default_flow_style=True, sort_keys=False, width=10**9)
+            yield f"{indent}{name}: {text.removesuffix('...' + chr(10)).strip()} # {field.description}"
+
+
+def read_yaml(path: Path, text: str | None = None) -> dict[str, Any]:
+    """A YAML file's mapping; an empty file's is empty.
+
+    :param text: the file's text, if it was read already
+    :raises SettingsError: one line for a file that cannot be read or holds no mapping
+    """
+    try:
+        values = yaml.load(path.read_text(encoding="utf-8") if text is None else text, _Loader)
+    except OSError as error:
+        raise SettingsError(f"config {path}: {error.strerror or error}") from None
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise SettingsError(f"config {path}: not a YAML file ({' '.join(str(error).split())})") from None
+    if values is None:
+        return {}
+    if not isinstance(values, dict):
+        raise SettingsError(f"config {path}: a mapping of parameters is needed")
+    return values
+
+
+def _migrated(settings: type[Settings], values: dict[str, Any], path: Path) -> dict[str, Any]:
+    """A file's values in the present format; one warning names all old names in it."""
+    number = check_format(values.pop("format", FORMAT))
+    current, renamed = migrate_config(settings, values, number)
+    if renamed:
+        old, new = (", ".join(names) for names in zip(*renamed, strict=True))
+        warn_renamed(f"{path}: {old}", new, stacklevel=4)
+    return current
+
+
+def _check_groups(settings: type[Settings], values: Mapping[str, Any], prefix: str) -> None:
+    """Refuse unknown names and scalars where a group belongs, with the whole path in the message."""
+    for name, value in values.items():
+        field = settings.model_fields.get(name) if isinstance(name, str) else None
+        if field is None:
+            hint = suggest(str(name), [prefix + ".".join(path) for path in leaf_paths(settings)])
+            if not prefix and hint:
+                hint += ", in its group"
+            raise SettingsError(f"{prefix}{name} is not a parameter{hint}")
+        group = group_of(field.annotation)
+        if group is not None:
+            if not isinstance(value, Mapping):
+                raise SettingsError(f"{prefix}{name} = {format_value(value)}: a mapping of parameters is needed")
+            _check_groups(group, value, f"{prefix}{name}.")

@@ -1,0 +1,292 @@
+"""Policies of strangers: flown or refused in one line, never run; and those of plain SB3."""
+
+import base64
+import io
+import json
+import os
+import pickle
+import shutil
+import subprocess
+import sys
+import zipfile
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3 import DDPG, TD3
+
+from sb3_flock import FlockCNN, FlockPolicy, evaluate, load_policy, make_vec_env
+from sb3_flock.serialization.load import PolicyError
+from tests.helpers import SMALL_MODEL
+
+
+def rewrite(path, changes):
+    """The same archive with some members changed or (None) left out."""
+    copy = path.with_name("changed.zip")
+    with zipfile.ZipFile(path) as old, zipfile.ZipFile(copy, "w") as new:
+        for name in old.namelist():
+            content = changes.get(name, old.read(name))
+            if content is not None:
+                new.writestr(name, content)
+    return copy
+
+
+def test_a_run_folder_means_its_best_model_else_its_final(saved, tmp_path):
+    run = tmp_path / "run"
+    run.mkdir()
+    with pytest.raises(PolicyError, match=r"no best_model"):
+        load_policy(run)
+    shutil.copy(saved, run / "final_model.zip")
+    assert load_policy(run).path.name == "final_model.zip"
+    shutil.copy(saved, run / "best_model.zip")
+    assert load_policy(run).path.name == "best_model.zip"
+
+
+def broken_files(saved):
+    """Files that are no policy, with the words that tell why."""
+    whole = saved.read_bytes()
+    with zipfile.ZipFile(saved) as archive:
+        member = json.loads(archive.read("flock.json"))
+    truncated, text, empty = (saved.with_name(name) for name in ("truncated.zip", "text.zip", "empty.zip"))
+    truncated.write_bytes(whole[: len(whole) // 2])
+    text.write_text("not a zip")
+    empty.write_bytes(b"")
+    wider = {**member, "config": {**member["config"], "network": {**member["config"]["network"], "features_dim": 32}}}
+    unknown = {**member, "config": {**member["config"], "colour": "red"}}
+    yield saved.with_name("missing.zip"), "no such file"
+    yield truncated, "damaged or not a policy"
+    yield text, "damaged or not a policy"
+    yield empty, "damaged or not a policy"
+    for changes, words in (
+        ({"flock.json": None, "data": None}, "not a policy of sb3_flock"),
+        ({"flock.json": b"{"}, "damaged or not a policy"),
+        ({"flock.json": b"[]"}, "do not fit"),
+        ({"flock.json": json.dumps(wider).encode()}, "do not fit"),
+        ({"flock.json": json.dumps(unknown).encode()}, "colour is not a parameter"),
+        ({"flock.json": json.dumps({**member, "format": 9}).encode()}, "format = 9"),
+        ({"policy.pth": b"garbage"}, "damaged or not a policy"),
+        ({"policy.pth": None}, "damaged or not a policy"),
+    ):
+        yield rewrite(saved, changes), words
+
+
+def test_files_that_are_no_policy_are_told_in_one_line(saved):
+    for path, words in broken_files(saved):
+        with pytest.raises(PolicyError, match=words) as error:
+            load_policy(path)
+        assert "\n" not in str(error.value)
+        assert str(path) in str(error.value)
+
+
+def test_weights_that_are_not_finite_are_refused(model, saved):
+    state = {name: value.clone() for name, value in model.policy.state_dict().items()}
+    state["actor.mu.0.bias"][0] = float("nan")
+    with saved.with_name("policy.pth").open("wb") as file:
+        th.save(state, file)
+    with pytest.raises(PolicyError, match="not finite"):
+        load_policy(rewrite(saved, {"policy.pth": saved.with_name("policy.pth").read_bytes()}))
+
+
+class Hostile:
+    """Unpickled, it makes a file."""
+
+    def __init__(self, mark):
+        self.mark = str(mark)
+
+    def __reduce__(self):
+        return os.mkdir, (self.mark,)
+
+
+def tensors(state, pickled=None):
+    """A ``.pth`` member, with another pickle in it if wanted."""
+    file = io.BytesIO()
+    th.save(state, file)
+    if pickled is None:
+        return file.getvalue()
+    copy = io.BytesIO()
+    with zipfile.ZipFile(file) as old, zipfile.ZipFile(copy, "w") as new:
+        for name in old.namelist():
+            new.writestr(name, pickled if name.endswith("data.pkl") else old.read(name))
+    return copy.getvalue()
+
+
+def hostile_files(saved, mark):
+    """Archives with code in each part that a reader might unpickle."""
+    code = pickle.dumps(Hostile(mark))
+    serialized = {":type:": "x", ":serialized:": base64.b64encode(code).decode()}
+    with zipfile.ZipFile(saved) as archive:
+        data = json.loads(archive.read("data"))
+    yield rewrite(saved, {"data": json.dumps({**data, "policy_class": serialized}).encode()})
+    yield rewrite(saved, {"data": json.dumps({**data, "policy_class": serialized}).encode(), "flock.json": None})
+    for name in ("policy.pth", "actor.optimizer.pth", "pytorch_variables.pth"):
+        yield rewrite(saved, {name: code})
+        yield rewrite(saved, {name: tensors({}, pickled=code)})
+    for name in ("data", "flock.json"):
+        yield rewrite(saved, {name: code})
+
+
+def test_no_code_in_a_file_is_ever_run(saved, tmp_path):
+    mark = tmp_path / "owned"
+    flown = 0
+    for file in hostile_files(saved, mark):
+        try:
+            load_policy(file)
+            flown += 1
+        except PolicyError as error:
+            assert "\n" not in str(error)  # noqa: PT017 - either is fine
+        assert not mark.exists()
+    assert flown >= 5  # what flying does not need is not even read
+
+
+def test_the_hostile_files_are_hostile_and_trust_means_trust(saved, tmp_path):
+    mark = tmp_path / "owned"
+    first = next(hostile_files(saved, mark))
+    with pytest.raises(PolicyError, match="SB3 cannot load it either"):  # the code left no policy class
+        load_policy(first, trust=True)
+    assert mark.exists()
+
+
+def test_trust_loads_what_sb3_loads(model, saved):
+    observations = np.random.default_rng(0).random((4, 3, 11, 11)).astype(np.float32)
+    trusted = load_policy(saved, trust=True)
+    assert trusted.config == SMALL_MODEL
+    np.testing.assert_array_equal(trusted.predict(observations)[0], load_policy(saved).predict(observations)[0])
+
+
+def bombs(saved):
+    """Small files that would unpack, or be built, to gigabytes."""
+    with zipfile.ZipFile(saved) as archive:
+        parts = {name: archive.read(name) for name in archive.namelist()}
+    zeros = b"\0" * 2**20
+
+    def bomb(name, changes, **kwargs):
+        path = saved.with_name(f"{name}.zip")
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
+            for part, content in {**parts, **changes}.items():
+                if content is None:
+                    with file.open(zipfile.ZipInfo(part), "w") as member:
+                        member._compressor = zipfile._get_compressor(zipfile.ZIP_DEFLATED)
+                        member._zinfo.compress_type = zipfile.ZIP_DEFLATED
+                        for _ in range(300):
+                            member.write(zeros)
+                else:
+                    file.writestr(part, content, **kwargs)
+        return path
+
+    yield bomb("large", {"policy.pth": None})
+    lying = bomb("lying", {"policy.pth": None})
+    lying.write_bytes(lying.read_bytes().replace((300 * 2**20).to_bytes(4, "little"), (1000).to_bytes(4, "little")))
+    yield lying
+    inner = io.BytesIO()
+    with (
+        zipfile.ZipFile(io.BytesIO(tensors({"x": th.zeros(1)}))) as old,
+        zipfile.ZipFile(inner, "w", zipfile.ZIP_DEFLATED) as new,
+    ):
+        for name in old.namelist():
+            new.writestr(name, 300 * zeros if name.endswith("data/0") else old.read(name))
+    yield bomb("inner", {"policy.pth": inner.getvalue()})
+    yield bomb("lzma", {}, compress_type=zipfile.ZIP_LZMA)
+    member = json.loads(parts["flock.json"])
+    wide = {
+        "channels": [65536, 65536],
+        "kernel_size": 15,
+        "features_dim": 65536,
+        "n_critics": 32,
+        "net_arch": [65536, 65536],
+    }
+    member["config"]["network"].update(wide)
+    member["config"]["scenario"]["n_anchors"] = 101
+    yield bomb("wide", {"flock.json": json.dumps(member)})
+    promised = tensors({"actor.mu.0.weight": th.empty(2**20, 2**20, device="meta")})
+    yield bomb("promised", {"flock.json": json.dumps(member), "policy.pth": promised})
+    yield bomb("deep", {"flock.json": "[" * 10**6})
+    yield bomb("digits", {"flock.json": '{"format": ' + "9" * 10**6 + "}"})
+    view = th.zeros(1).expand(10**12)
+    yield bomb("view", {"policy.pth": tensors(dict.fromkeys(("actor.mu.0.bias", "actor.mu.0.weight"), view))})
+
+
+def test_bombs_are_refused_within_bounds(saved):
+    code = """
+import resource, sys, time
+from sb3_flock import load_policy
+from sb3_flock.serialization.load import PolicyError
+load_policy(sys.argv[1])
+before, start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.monotonic()
+for path in sys.argv[2:]:
+    try:
+        load_policy(path)
+    except PolicyError as error:
+        print(error)
+megabytes = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / (1024 if sys.platform == "linux" else 2**20)
+assert megabytes < 200, megabytes
+"""
+    files = [str(path) for path in bombs(saved)]
+    assert all(os.path.getsize(path) < 3e6 for path in files)
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(saved), *files], capture_output=True, text=True, check=False, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert [line.split(":")[0] for line in lines] == files
+
+
+def test_names_that_point_outside_write_nothing(saved, tmp_path):
+    with zipfile.ZipFile(saved, "a") as archive:
+        archive.writestr("../outside", "x")
+        archive.writestr("/tmp/../outside", "x")
+    load_policy(saved)
+    assert {path.name for path in tmp_path.iterdir()} == {"policy.zip"}
+
+
+def test_what_an_error_quotes_from_a_file_cannot_talk_to_the_terminal(model, saved):
+    state = {**model.policy.state_dict(), "actor.\x1b[2J": th.zeros(1)}
+    with pytest.raises(PolicyError) as error:
+        load_policy(rewrite(saved, {"policy.pth": tensors(state)}))
+    assert str(error.value).isprintable()
+
+
+@pytest.mark.parametrize("algorithm", [DDPG, TD3])
+@pytest.mark.parametrize(
+    ("policy", "kwargs"),
+    [
+        (FlockPolicy, {}),
+        (FlockPolicy, {"action_bound": "tanh", "net_arch": [32, 16], "features_extractor_kwargs": {"layer_norm": True}}),
+        (
+            "MlpPolicy",
+            {"features_extractor_class": FlockCNN, "net_arch": [24], "features_extractor_kwargs": {"features_dim": 8}},
+        ),
+    ],
+)
+def test_files_of_plain_sb3_with_our_parts_fly_without_trust(tmp_path, algorithm, policy, kwargs):
+    plain = algorithm(policy, make_vec_env(SMALL_MODEL.scenario, seed=0), policy_kwargs=kwargs, buffer_size=10, seed=0)
+    for parameter in plain.policy.parameters():
+        parameter.data.mul_(3)  # out of the small start, so that the bounds count
+    plain.save(tmp_path / "plain.zip")
+    with pytest.warns(UserWarning, match="taken to be the default"):
+        loaded, trusted = (load_policy(tmp_path / "plain.zip", trust=trust) for trust in (False, True))
+    observations = np.random.default_rng(0).random((50, 3, 11, 11)).astype(np.float32)
+    expected = plain.predict(observations, deterministic=True)[0]
+    np.testing.assert_array_equal(loaded.predict(observations)[0], expected)
+    np.testing.assert_array_equal(trusted.predict(observations)[0], expected)
+
+
+@pytest.mark.parametrize("trust", [False, True])
+def test_a_second_look_in_a_file_of_plain_sb3_is_taken_to_be_ours(tmp_path, trust):
+    scenario = SMALL_MODEL.scenario.replace(motion_lag=0.2)
+    plain = DDPG(FlockPolicy, make_vec_env(scenario, seed=0), buffer_size=10, seed=0)
+    plain.save(tmp_path / "plain.zip")
+    with pytest.warns(UserWarning, match="taken to be the default"):
+        loaded = load_policy(tmp_path / "plain.zip", trust=trust)
+    assert loaded.scenario.motion_lag == 0.2
+    assert evaluate(loaded, episodes=1)["return"].n == 1
+
+
+def test_files_of_plain_sb3_with_other_parts_need_trust(tmp_path):
+    plain = DDPG("MlpPolicy", make_vec_env(SMALL_MODEL.scenario, seed=0), policy_kwargs={"net_arch": [8]}, buffer_size=10)
+    plain.save(tmp_path / "plain.zip")
+    with pytest.raises(PolicyError, match="trust"):
+        load_policy(tmp_path / "plain.zip")
+    observations = np.random.default_rng(0).random((4, 3, 11, 11)).astype(np.float32)
+    with pytest.warns(UserWarning, match="taken to be the default"):
+        trusted = load_policy(tmp_path / "plain.zip", trust=True)
+    np.testing.assert_array_equal(trusted.predict(observations)[0], plain.predict(observations, deterministic=True)[0])

@@ -1,0 +1,124 @@
+import csv
+import functools
+import signal
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_flock.config.training import TrainingConfig
+from sb3_flock.serialization.load import PolicyError, checkpoint_paths
+from sb3_flock.serialization.yaml_io import load_config, to_yaml
+from sb3_flock.settings import SettingsError
+from sb3_flock.training.checkpoint import LoadedCheckpoint, reproducibility_warnings
+from sb3_flock.training.signals import GracefulShutdown
+from sb3_flock.training.train import resume, train
+from tests.helpers import quiet, tiny, training_state
+
+
+class PowerError(Exception):
+    pass
+
+
+class PowerFails(BaseCallback):
+    """The power fails after so many transitions."""
+
+    def __init__(self, steps):
+        super().__init__()
+        self.steps = steps
+
+    def _on_step(self):
+        if self.num_timesteps >= self.steps:
+            raise PowerError
+        return True
+
+
+LONG = {"scenario.max_cycles": 40, "save_freq": 120, "eval_freq": 180, "total_timesteps": 600, "buffer_size": 330}
+
+
+@pytest.mark.parametrize(
+    ("algo", "changes"),
+    [
+        ("ddpg", {}),
+        ("ddpg-sb3", {}),
+        ("td3", {"n_steps": 3}),
+        ("sac", {}),
+        ("ddpg", {"buffer_size": 10_000}),
+        ("ddpg", {"motion_lag": 0.4, "expert": "orca", "expert_fraction": 0.5}),
+        ("ddpg", {"expert": "orca", "bc_coef": 1.0, "expert_fraction": 0.3}),
+        ("ddpg", {"expert": "mpc", "bc_coef": 1.0, "expert_fraction": 0.3}),
+        ("ddpg", {"expert": "olfati-saber", "expert_fraction": 0.9, "train_env.flock_sizes": [1, 2]}),
+    ],
+)
+def test_a_resumed_run_ends_like_one_never_interrupted_to_the_last_bit(tmp_path, algo, changes):
+    one = train(tiny(tmp_path / "a", algo=algo, **{**LONG, **changes}), quiet())
+    config = tiny(tmp_path / "b", algo=algo, **{**LONG, **changes})
+    folder = tmp_path / "b" / "runs" / one.folder.name
+    for steps in (200, 460):
+        go_on = functools.partial(resume, folder) if folder.exists() else functools.partial(train, config)
+        with pytest.raises(PowerError):
+            go_on(quiet(), callbacks=[PowerFails(steps)])
+        np.random.seed(steps)  # noqa: NPY002 - another process would have other streams
+        th.manual_seed(steps)
+    other = resume(folder, quiet())
+    ours, theirs = training_state(one), training_state(other)
+    assert ours.keys() == theirs.keys()
+    assert len(ours) > 100
+    for name, value in ours.items():
+        np.testing.assert_array_equal(value, theirs[name], err_msg=name)
+
+
+def test_a_complete_run_goes_on_only_with_more_transitions(tmp_path):
+    first = train(tiny(tmp_path), quiet())
+    for changes in (None, {"total_timesteps": 100}, {"total_timesteps": 300}):
+        with pytest.raises(SettingsError, match="a larger total_timesteps"):
+            resume(first.folder, quiet(), changes)
+    with pytest.raises(SettingsError, match="seed cannot change"):
+        resume(first.folder, quiet(), {"seed": 1})
+    with pytest.raises(SettingsError, match="not a run folder"):
+        resume(tmp_path, quiet())
+    half_written = first.folder / ".rl_model_9_steps.zip.tmp"
+    half_written.write_bytes(b"PK")
+    longer = resume(first.folder, quiet(), {"total_timesteps": 420}, command=["sb3-flock", "train", "--resume"])
+    assert longer.model.num_timesteps == 420
+    assert not half_written.exists()
+    assert load_config(TrainingConfig, first.folder / "config.yaml").total_timesteps == 420
+    assert np.load(first.folder / "evaluations.npz")["timesteps"].tolist() == [120, 240, 300, 360, 420]
+    assert (first.folder / "command.txt").read_text().endswith("\nsb3-flock train --resume\n")
+    with open(first.folder / "progress.csv") as file:
+        steps = [int(row["time/total_timesteps"]) for row in csv.DictReader(file)]
+    assert steps == sorted(steps)
+    assert {120, 300, 420} <= set(steps)
+
+
+def test_other_surroundings_are_told(tmp_path):
+    first = train(tiny(tmp_path), quiet())
+    checkpoint = LoadedCheckpoint(checkpoint_paths(first.folder)[-1], 10**9)
+    assert reproducibility_warnings(checkpoint, first.config) == ""
+    checkpoint.state["runtime_info"]["torch"] = "1.0"
+    assert "; not bit-exact: torch 1.0 then, " in reproducibility_warnings(checkpoint, first.config)
+    assert "workers start new episodes" in reproducibility_warnings(checkpoint, first.config.replace(num_cpus=2))
+
+
+def test_a_checkpoint_of_another_config_is_refused(tmp_path):
+    first = train(tiny(tmp_path), quiet())
+    wider = tiny(tmp_path, features_dim=24, total_timesteps=900)
+    (first.folder / "config.yaml").write_text(to_yaml(wider))
+    with pytest.raises(PolicyError, match="not a checkpoint of this run's config"):
+        resume(first.folder, quiet())
+
+
+def test_a_signal_that_comes_too_late_to_save_is_not_lost():
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job inherits an ignored one
+    waited_for = []
+
+    def work():
+        with GracefulShutdown().waiting() as signals:
+            signal.raise_signal(signal.SIGINT)
+            waited_for.append(signals.caught)
+
+    with pytest.raises(KeyboardInterrupt):
+        work()
+    assert waited_for == [signal.SIGINT]
+    assert signal.signal(signal.SIGINT, handler) is signal.default_int_handler

@@ -1,0 +1,244 @@
+import os
+import shutil
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pygame
+import pytest
+from PIL import Image, ImageGrab
+
+from sb3_flock.cli import main
+from sb3_flock.controllers import make_controller
+from sb3_flock.envs.rendering import HEADER, SIDE, Renderer
+from sb3_flock.serialization.load import load_policy
+from sb3_flock.settings import SettingsError
+from sb3_flock.sim import Scenario
+from sb3_flock.sim.sensors import SensorErrors
+from sb3_flock.viz.play import Game, play
+
+
+@pytest.fixture
+def game():
+    return Game(make_controller("go-to-waypoint"), Scenario(n_vehicles=3, n_obstacles=1), seed=1)
+
+
+def press(game, key, character=""):
+    game.handle(pygame.event.Event(pygame.KEYDOWN, key=key, unicode=character))
+
+
+def mouse(game, kind, pixels):
+    button = {} if kind == pygame.MOUSEMOTION else {"button": 1}
+    game.handle(pygame.event.Event(kind, pos=tuple(round(x) for x in pixels), **button))
+
+
+def test_the_waypoint_is_dragged_and_stays_where_it_was_left(game):
+    mouse(game, pygame.MOUSEBUTTONDOWN, game.renderer.pixels_of(game.world.waypoints[0]))
+    place = np.array([0.4, -0.3])
+    mouse(game, pygame.MOUSEMOTION, game.renderer.pixels_of(place))
+    np.testing.assert_allclose(game.world.waypoints[0], place, atol=0.005)
+    mouse(game, pygame.MOUSEBUTTONUP, game.renderer.pixels_of(place))
+    mouse(game, pygame.MOUSEMOTION, game.renderer.pixels_of(-place))
+    before = np.linalg.norm(game.world.positions[0] - place, axis=-1)
+    for _ in range(20):
+        game.step()
+    np.testing.assert_allclose(game.world.waypoints[0], place, atol=0.005)
+    assert (np.linalg.norm(game.world.positions[0] - place, axis=-1) < before).all()
+    assert game.world.scenario.n_obstacles == 1  # a drag is not a click
+
+
+def test_a_click_drops_an_obstacle_and_another_removes_it(game):
+    place = game.renderer.pixels_of(np.array([0.9, 0.9]))
+    mouse(game, pygame.MOUSEBUTTONDOWN, place)
+    assert game.world.scenario.n_obstacles == 2
+    np.testing.assert_allclose(game.world.obstacle_positions[0, 1], [0.9, 0.9], atol=0.005)
+    game.step()
+    first = game.world.obstacle_positions[0, 0].copy()
+    mouse(game, pygame.MOUSEBUTTONDOWN, game.renderer.pixels_of(game.world.obstacle_positions[0, 1]))
+    assert game.world.scenario.n_obstacles == 1
+    np.testing.assert_array_equal(game.world.obstacle_positions[0, 0], first)
+    mouse(game, pygame.MOUSEBUTTONDOWN, (SIDE + 20, 300))  # beside the arena
+    assert game.world.scenario.n_obstacles == 1
+
+
+def test_an_added_obstacle_walks(game):
+    mouse(game, pygame.MOUSEBUTTONDOWN, game.renderer.pixels_of(np.array([0.5, 0.9])))
+    before = game.world.obstacle_positions[0, 1].copy()
+    for _ in range(5):
+        game.step()
+    assert 0 < np.linalg.norm(game.world.obstacle_positions[0, 1] - before) < 0.5 * 0.1
+
+
+def test_vehicles_come_and_go_and_the_others_stay(game):
+    others = game.world.positions.copy()
+    press(game, pygame.K_PLUS, "+")
+    assert game.world.scenario.n_vehicles == 4
+    np.testing.assert_array_equal(game.world.positions[:, :3], others)
+    game.step()
+    for _ in range(6):
+        press(game, pygame.K_MINUS)
+    assert game.world.scenario.n_vehicles == 1  # one stays
+
+
+def test_pause_step_and_new_episode(game):
+    press(game, pygame.K_SPACE)
+    assert game.is_paused
+    assert game.caption == "sb3_flock: 3 vehicles, 1 obstacle, paused"
+    press(game, pygame.K_PERIOD)
+    assert game.world.steps == 1
+    here = game.world.positions.copy()
+    press(game, pygame.K_r)
+    assert game.world.steps == 0
+    assert not np.array_equal(game.world.positions, here)
+    press(game, pygame.K_q)
+    assert game.is_over
+
+
+def test_what_each_vehicle_sees_is_shown_in_turn(game):
+    def panel():
+        return pygame.surfarray.array3d(game.paint())[SIDE:]
+
+    plain = panel()
+    for vehicle in range(3):
+        press(game, pygame.K_v)
+        assert f"vehicle {vehicle} is watched" in game.caption
+        assert (panel() < 100).sum() > (plain < 100).sum()
+    press(game, pygame.K_v)
+    np.testing.assert_array_equal(panel(), plain)
+
+
+def test_a_flight_has_no_end(game):
+    game.world.steps = game.world.scenario.max_cycles
+    obstacle = game.world.obstacle_positions.copy()
+    game.step()
+    assert game.world.steps == 1
+    assert np.linalg.norm(game.world.obstacle_positions - obstacle) < 0.02
+
+
+def test_policies_and_laws_that_remember_fly_while_the_flock_changes():
+    late = SensorErrors(position_noise=0.01, delay=0.2)
+    for flyer, changes in (
+        (load_policy("ddpg-5v2o"), {}),
+        (load_policy("ddpg-5v2o"), {"sensors": late}),
+        (load_policy("general"), {"motion_lag": 0.2}),
+        (make_controller("orca"), {}),
+    ):
+        game = Game(flyer, Scenario(n_vehicles=2, n_obstacles=1, **changes))
+        for key in (pygame.K_PLUS, pygame.K_PLUS, pygame.K_v, pygame.K_MINUS):
+            press(game, key)
+            game.step()
+            game.paint()
+        assert game.world.scenario.n_vehicles == 3
+
+
+def test_the_loop_flies_in_real_time_and_ends(monkeypatch):
+    seen = []
+    monkeypatch.setattr(Game, "paint", lambda self: seen.append(self) or pygame.Surface((SIDE, HEADER)))
+    monkeypatch.setattr(
+        "sb3_flock.play.pygame.event.get", lambda: [pygame.event.Event(pygame.QUIT)] if len(seen) > 20 else []
+    )
+    start = time.monotonic()
+    play(make_controller("go-to-waypoint"), Scenario(), speed=4.0)
+    assert 0 < seen[0].world.steps <= 40 * (time.monotonic() - start) + 1
+    assert not pygame.display.get_init()
+
+
+def test_mistakes_are_one_line(monkeypatch, capsys):
+    with pytest.raises(SettingsError, match="--speed 0"):
+        play(make_controller("random"), Scenario(), speed=0.0)
+    monkeypatch.setenv("SDL_VIDEODRIVER", "x11")
+    monkeypatch.setenv("DISPLAY", ":12345")
+    assert main(["play", "--controller", "random"]) == 2
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1
+    assert "no display to open a window on" in message
+    monkeypatch.delenv("SDL_VIDEODRIVER")
+    monkeypatch.delenv("DISPLAY")
+    assert main(["play", "--controller", "random"]) == 2
+
+
+@pytest.fixture
+def screen(monkeypatch):
+    """An X server of its own, which does not start anew (and drop who is just connecting) as its last client leaves."""
+    read, write = os.pipe()
+    server = subprocess.Popen(
+        ["Xvfb", "-noreset", "-displayfd", str(write), "-screen", "0", "1000x800x24", "-nolisten", "tcp"],
+        pass_fds=[write],
+    )
+    os.close(write)
+    with os.fdopen(read) as number:
+        display = f":{number.readline().strip()}"
+    monkeypatch.setenv("DISPLAY", display)
+    monkeypatch.setenv("SDL_VIDEODRIVER", "x11")
+    yield display
+    server.terminate()
+    server.wait()
+
+
+@pytest.mark.skipif(not (shutil.which("Xvfb") and shutil.which("xdotool")), reason="needs Xvfb and xdotool")
+def test_a_real_window_with_a_real_mouse_and_keys(screen, tmp_path):
+    def xdotool(*words):
+        return subprocess.run(["xdotool", *map(str, words)], check=False, capture_output=True, text=True).stdout.strip()
+
+    def point_at(x, y):
+        xdotool("mousemove", "--window", window, round(x), round(y))
+        time.sleep(0.3)
+
+    def wait_for(said, seconds=60):
+        """The window whose title says so: SDL may make another one before it is the last."""
+        deadline = time.monotonic() + seconds
+        while True:
+            visible = xdotool("search", "--onlyvisible", "--class", ".").split()
+            found = {number: xdotool("getwindowname", number) for number in visible}
+            for number, title in found.items():
+                if said in title:
+                    return number
+            assert (process.poll(), time.monotonic() < deadline) == (None, True), found
+            time.sleep(0.05)
+
+    command = [sys.executable, "-m", "sb3_flock.cli", "play", "--controller", "go-to-waypoint", "--n-vehicles", "4"]
+    process = subprocess.Popen([*command, "--set", "waypoint_route=[[0.5, 0.5]]", "--set", "obstacle_max_speed=0"])
+    try:
+        window = wait_for("4 vehicles, 1 obstacle")
+        point_at(60, HEADER + 60)
+        xdotool("click", 1)
+        wait_for("2 obstacles")
+        xdotool("key", "space")
+        wait_for("paused")
+        point_at(160, HEADER + 60)
+        xdotool("key", "plus")
+        wait_for("5 vehicles")
+        xdotool("key", "v")
+        wait_for("vehicle 0 is watched")
+        renderer = Renderer(Scenario(), "rgb_array", fps=0)
+        here, there = renderer.pixels_of((0.5, 0.5)), renderer.pixels_of((0.8, -0.8))
+        point_at(*here)
+        xdotool("mousedown", 1)
+        point_at(*there)
+        xdotool("mouseup", 1)
+        picture = ImageGrab.grab(xdisplay=screen)
+        picture.save(tmp_path / "window.png")
+        colors = np.asarray(picture)
+        corner = np.argwhere((colors == 255).all(-1)).min(0)  # of the window on the black screen
+
+        def color_at(x, y):
+            return tuple(colors[corner[0] + round(y), corner[1] + round(x)].tolist())
+
+        assert color_at(60, HEADER + 60) == (204, 121, 167)  # the obstacle
+        assert color_at(*there) == (0, 0, 0)  # the waypoint's cross
+        assert color_at(*here) != (0, 0, 0)
+        point_at(60, HEADER + 60)
+        xdotool("click", 1)
+        wait_for("1 obstacle,")
+        xdotool("key", "q")
+        assert process.wait(20) == 0
+    finally:
+        process.kill()
+        process.wait()
+
+
+def test_the_legend_fits():
+    game = Game(make_controller("random"), Scenario(n_vehicles=2, n_obstacles=1))
+    header = pygame.surfarray.array3d(game.paint())[SIDE - 6 : SIDE, :HEADER]
+    assert Image.fromarray(header).convert("L").getextrema()[0] > 200

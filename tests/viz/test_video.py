@@ -1,0 +1,119 @@
+import re
+import shutil
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+from PIL import Image
+
+from sb3_flock.cli import main
+from sb3_flock.controllers import make_controller
+from sb3_flock.envs.rendering import HEADER, PALETTE, SIDE
+from sb3_flock.settings import SettingsError
+from sb3_flock.sim import Scenario
+from sb3_flock.viz.video import render
+from tests.browser import Browser
+
+SCENARIO = Scenario(max_cycles=30)
+
+
+@pytest.fixture
+def flyer():
+    return make_controller("go-to-waypoint")
+
+
+def test_a_gif_moves_in_the_time_it_should(tmp_path, flyer):
+    path = render(flyer, SCENARIO, tmp_path / "flight.gif", speed=2.0)
+    with Image.open(path) as film:
+        assert film.size == (SIDE, HEADER + SIDE)
+        assert film.n_frames == 31
+        assert film.info["duration"] == 50
+        assert film.info["loop"] == 0
+        first = np.asarray(film.convert("RGB"))
+        film.seek(30)
+        assert (np.asarray(film.convert("RGB")) != first).any(-1).mean() > 0.005
+    for color in PALETTE:
+        assert (np.abs(first.astype(int) - color).max(-1) < 12).any()
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(("speed", "frames", "fps"), [(1.0, 31, 10), (20.0, 8, 50)])
+def test_an_mp4_is_one(tmp_path, flyer, speed, frames, fps):
+    path = render(flyer, SCENARIO, tmp_path / "flight.mp4", speed=speed)
+    n_frames, _ = imageio_ffmpeg.count_frames_and_secs(str(path))
+    assert n_frames == frames
+    reader = imageio_ffmpeg.read_frames(str(path))
+    meta = next(reader)
+    reader.close()
+    assert meta["size"] == (SIDE, HEADER + SIDE)
+    assert meta["fps"] == fps
+    assert meta["codec"] == "h264"
+
+
+@pytest.mark.parametrize(("kind", "begin"), [("png", b"\x89PNG"), ("svg", b"<?xml")])
+def test_figures(tmp_path, flyer, kind, begin):
+    path = render(flyer, SCENARIO, tmp_path / f"flight.{kind}")
+    assert path.read_bytes().startswith(begin)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_page_holds_everything_in_itself(tmp_path, flyer):
+    path = render(flyer, SCENARIO, tmp_path / "flight.html", title="a < b & c")
+    page = path.read_text()
+    assert "<h1>a &lt; b &amp; c</h1>" in page
+    assert not re.search(r"https?:|<script", page)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.skipif(not shutil.which("chromedriver"), reason="needs Chromium and chromedriver")
+def test_a_page_plays_in_a_browser(tmp_path, flyer):
+    path = render(flyer, SCENARIO, tmp_path / "flight.html", speed=1.0)
+    with Browser() as browser:
+        browser.open(path.as_uri())
+        player = "const player = document.querySelector('video');"
+        browser.wait_for(player + "return player.currentTime > 0.3 && !player.paused && player.videoWidth == 640")
+        browser.run(player + "player.pause(); player.currentTime = 2")
+        browser.wait_for(player + "return player.paused && !player.seeking && player.currentTime == 2")
+        browser.run(player + "player.play()")
+        browser.wait_for(player + "return player.currentTime > 2.3")
+        assert browser.console() == []
+
+
+def test_what_is_wrong_is_told_before_the_flight(tmp_path):
+    class Never:
+        def act(self, sensing, scenario):
+            raise AssertionError
+
+    for name, speed, said in (
+        ("flight.avi", 1.0, "ends in .gif, .mp4, .html, .png, .svg"),
+        ("there/flight.gif", 1.0, "there is no folder"),
+        ("flight.gif", float("nan"), "--speed nan"),
+    ):
+        with pytest.raises(SettingsError, match=re.escape(said)):
+            render(Never(), SCENARIO, tmp_path / name, speed=speed)
+
+
+def test_an_older_film_stays_if_the_flight_fails(tmp_path):
+    class Fails:
+        def act(self, sensing, scenario):
+            raise RuntimeError
+
+    path = tmp_path / "flight.mp4"
+    path.write_bytes(b"older")
+    with pytest.raises(RuntimeError):
+        render(Fails(), SCENARIO, path)
+    assert path.read_bytes() == b"older"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_the_command(tmp_path, capsys):
+    path = tmp_path / "flight.gif"
+    words = ["render", "ddpg-3v1o", "--n-vehicles", "2", "--set", "max_cycles=3", "--out", str(path)]
+    assert main(words) == 0
+    assert capsys.readouterr().out == f"{path}\n"
+    with Image.open(path) as film:
+        assert film.n_frames == 4
+    assert main(["render", "--out", str(path)]) == 2
+    assert "a POLICY or --controller NAME is needed" in capsys.readouterr().err
+    with pytest.raises(SystemExit, match="2"):
+        main(["render", "ddpg-3v1o"])
