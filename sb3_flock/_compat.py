@@ -44,7 +44,7 @@ def optimizers_of(model: BaseAlgorithm) -> list[th.optim.Optimizer]:
 
 def n_updates(model: BaseAlgorithm) -> int:
     """Number of updates so far."""
-    return int(model._n_updates)  # type: ignore[attr-defined]
+    return int(model._n_updates)
 
 
 def progress_remaining(model: BaseAlgorithm) -> float:

@@ -585,4 +585,3 @@ def _print_config(options: argparse.Namespace, words: Sequence[str]) -> int:
 
     print(to_yaml(_config_of(options)), end="")
     return 0
-

@@ -68,7 +68,7 @@ class OnnxPolicy(nn.Module):
     ``previous_waypoint`` in the body frame of that time, and ``ego_motion`` ``(3,)``: the vehicle's present position in that frame [m, m]
     and its turn since [rad]. Before ``motion_lag`` has passed these are the first measurement.
 
-    All computations are in float64: float32 errs by 1e-5 rad/s where a policy is steep, and is hardly faster.
+    All computations are in float64: float32 is off by 1e-5 rad/s where a policy is steep, and is hardly faster.
 
     :param policy: a policy of DDPG, TD3 or SAC for the flock's observation
     :param scenario: the task with its sensing ranges
@@ -263,7 +263,7 @@ def random_sample_inputs(scenario: Scenario, count: int, seed: int) -> Iterator[
             dx, dy = world.positions[0, 0] - (x, y)
             ego_motion = np.array([cos * dx + sin * dy, cos * dy - sin * dx, world.headings[0, 0] - heading])
             sample = {**_measured_by_first_vehicle(world, sensing), **before, "ego_motion": ego_motion}
-        yield sample, observe(sensing, world.scenario)[0, 0]
+        yield sample, observe(sensing, scenario)[0, 0]
 
 
 def _measured_by_first_vehicle(world: World, sensing: Sensing) -> SampleInput:

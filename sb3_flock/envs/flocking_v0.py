@@ -1,7 +1,7 @@
 """Flocking: vehicles track a moving waypoint together, keep apart, avoid obstacles and stay within communication range.
 
 ========================  ==========================================================================================
-Import                    ``from sb3_flock import flocking_v0``; then ``pettingzoo.make("parallel", "flock/flocking-v0")``, too
+Import                    ``from sb3_flock import flocking_v0``, or ``pettingzoo.make("parallel", "flock/flocking-v0")``
 Agents                    ``vehicle_0`` ... ``vehicle_{n-1}``; all live through the whole episode
 Actions                   continuous, ``Box([0, -pi], [0.15, pi], (2,))``: speed v [m/s] and turn rate omega [rad/s]
 Observations              ``Box(0, 1e6, (3, 11, 11), float32)``: neighbors, obstacles, waypoint in the body frame; with
@@ -118,7 +118,7 @@ class parallel_env(ParallelEnv[str, Observation, Action]):  # noqa: N801 - Petti
     ) -> tuple[dict[str, Observation], dict[str, dict[str, Any]]]:
         """Start an episode.
 
-        :param seed: seeds this env's random stream; without one the stream goes on (the first reset draws a fresh one)
+        :param seed: seeds this env's random stream; without one the stream continues (the first reset draws a fresh one)
         :param options: ignored
         :return: observations and empty infos by agent
         """
@@ -151,7 +151,7 @@ class parallel_env(ParallelEnv[str, Observation, Action]):  # noqa: N801 - Petti
         return result
 
     def render(self) -> NDArray[np.uint8] | None:
-        """Draw the flock: an ``(height, width, 3)`` picture in ``rgb_array`` mode, a window in ``human`` mode.
+        """Draw the flock: an ``(height, width, 3)`` image in ``rgb_array`` mode, a window in ``human`` mode.
 
         :raises ImportError: without pygame
         """

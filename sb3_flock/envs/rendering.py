@@ -22,12 +22,12 @@ except ImportError as error:
     raise ImportError("rendering needs pygame: pip install 'sb3_flock[render]'") from error
 
 SIDE = 640
-"""Side of the arena's picture [pixels]."""
+"""Side of the arena's image [pixels]."""
 HEADER = 64
 """Height of the two lines above it: the step's metrics and the legend [pixels]. Multiples of 16 suit video codecs."""
 _MARGIN = 1.1
 """Width of the image [arenas]; the vehicles may leave the arena."""
-_FINE = 2
+_OVERSAMPLING = 2
 """Lines are drawn this many times larger and scaled down, which smooths them."""
 _TRAIL, _WAYPOINT_PATH = 20, 400
 """Steps of a vehicle's trail and of the waypoint's path."""
@@ -56,7 +56,7 @@ class Renderer:
 
     :param scenario: the task
     :param render_mode: ``"human"`` opens a window at the first drawing, ``"rgb_array"`` never does
-    :param fps: pictures per second in the window
+    :param fps: frames per second in the window
     """
 
     def __init__(self, scenario: Scenario, render_mode: str, fps: float) -> None:
@@ -64,8 +64,8 @@ class Renderer:
         self._window: pygame.Surface | None = None
         self._clock = pygame.time.Clock()
         self._arena = scenario.arena
-        self._scale = SIDE * _FINE / (2 * _MARGIN * max(scenario.arena, scenario.obstacle_half_side))
-        self._fine = pygame.Surface((SIDE * _FINE, SIDE * _FINE))
+        self._scale = SIDE * _OVERSAMPLING / (2 * _MARGIN * max(scenario.arena, scenario.obstacle_half_side))
+        self._canvas = pygame.Surface((SIDE * _OVERSAMPLING, SIDE * _OVERSAMPLING))
         pygame.font.init()
         self._font = pygame.font.Font(None, 19)
         self._steps = -1
@@ -90,21 +90,21 @@ class Renderer:
         picture = pygame.Surface((SIDE, HEADER + SIDE))
         picture.fill(_BACKGROUND)
         self._draw_arena(world, sensing)
-        picture.blit(pygame.transform.smoothscale(self._fine, (SIDE, SIDE)), (0, HEADER))
+        picture.blit(pygame.transform.smoothscale(self._canvas, (SIDE, SIDE)), (0, HEADER))
         self._draw_metrics(picture, world, sensing)
         self._draw_legend(picture)
         return picture
 
     def position_at(self, pixels: Pixels) -> NDArray[np.float64]:
         """The position in the world [m] under a pixel of the image."""
-        x, y = pixels[0] * _FINE, (pixels[1] - HEADER) * _FINE
-        half = SIDE * _FINE / 2
+        x, y = pixels[0] * _OVERSAMPLING, (pixels[1] - HEADER) * _OVERSAMPLING
+        half = SIDE * _OVERSAMPLING / 2
         return np.array([x - half, half - y]) / self._scale
 
     def pixels_of(self, position: NDArray[np.float64]) -> Pixels:
         """The pixel of the image over a position in the world [m]."""
         x, y = self._pixels(position)
-        return x / _FINE, y / _FINE + HEADER
+        return x / _OVERSAMPLING, y / _OVERSAMPLING + HEADER
 
     def close(self) -> None:
         """Close the window, if there is one."""
@@ -132,49 +132,55 @@ class Renderer:
             self._waypoints.append(world.waypoints[0].copy())
         self._steps = world.steps
 
-    # -- the arena, in fine pixels -----------------------------------------------------------------------------------
+    # -- the arena, in oversampled pixels -----------------------------------------------------------------------------------
 
     def _draw_arena(self, world: World, sensing: Sensing) -> None:
-        scenario, canvas = world.scenario, self._fine
+        scenario, canvas = world.scenario, self._canvas
         canvas.fill(_BACKGROUND)
         side = 2 * self._arena * self._scale
-        pygame.draw.rect(canvas, _GRID, (*self._pixels((-self._arena, self._arena)), side, side), width=2 * _FINE)
+        pygame.draw.rect(canvas, _GRID, (*self._pixels((-self._arena, self._arena)), side, side), width=2 * _OVERSAMPLING)
 
         positions, headings = world.positions[0], world.headings[0]
         close = sensing.neighbors.count(scenario.neighbor_separation) + sensing.obstacles.count(scenario.obstacle_separation)
         colors = [_VIOLATION if violates else _VEHICLE for violates in close[0]]
         disc, ring = (self._scale * reach for reach in (scenario.neighbor_separation / 2, scenario.link_range))
         for position in positions:
-            pygame.draw.circle(canvas, _GRID, self._pixels(position), ring, width=_FINE)
+            pygame.draw.circle(canvas, _GRID, self._pixels(position), ring, width=_OVERSAMPLING)
         for position, color in zip(positions, colors, strict=True):
             pygame.draw.circle(canvas, _paler(color, 0.8), self._pixels(position), disc)
         self._path(self._waypoints, _paler(_WAYPOINT, 0.6), 2, dotted=True)
         for vehicle in range(len(positions)):
             self._path([trail[vehicle] for trail in self._trails], _paler(_VEHICLE, 0.5), 1)
         for i, j in zip(sensing.neighbors.observers, sensing.neighbors.bodies, strict=True):
-            if i < j:  # each link is seen from both ends
-                pygame.draw.line(canvas, _LINK, self._pixels(positions[i]), self._pixels(positions[j]), width=2 * _FINE)
+            if i < j:  # each link is listed from both ends
+                pygame.draw.line(
+                    canvas, _LINK, self._pixels(positions[i]), self._pixels(positions[j]), width=2 * _OVERSAMPLING
+                )
         for obstacle in world.obstacle_positions[0]:
             pygame.draw.circle(
-                canvas, _OBSTACLE, self._pixels(obstacle), scenario.obstacle_separation * self._scale, width=2 * _FINE
+                canvas,
+                _OBSTACLE,
+                self._pixels(obstacle),
+                scenario.obstacle_separation * self._scale,
+                width=2 * _OVERSAMPLING,
             )
-            _square(canvas, self._pixels(obstacle), 6 * _FINE)
-        _cross(canvas, self._pixels(world.waypoints[0]), 8 * _FINE)
+            _square(canvas, self._pixels(obstacle), 6 * _OVERSAMPLING)
+        _cross(canvas, self._pixels(world.waypoints[0]), 8 * _OVERSAMPLING)
         for position, heading, color in zip(positions, headings, colors, strict=True):
-            _arrowhead(canvas, self._pixels(position), heading, max(7.0 * _FINE, 0.85 * disc), color)
+            _arrowhead(canvas, self._pixels(position), heading, max(7.0 * _OVERSAMPLING, 0.85 * disc), color)
 
     def _path(self, points: Iterable[NDArray[np.float64]], color: Color, width: int, dotted: bool = False) -> None:
         pixels = [self._pixels(point) for point in points]
         if dotted:
             for pixel in pixels[::2]:
-                pygame.draw.circle(self._fine, color, pixel, width)
+                pygame.draw.circle(self._canvas, color, pixel, width)
         elif len(pixels) > 1:
-            pygame.draw.lines(self._fine, color, False, pixels, width * _FINE)
+            pygame.draw.lines(self._canvas, color, False, pixels, width * _OVERSAMPLING)
 
     def _pixels(self, point: Iterable[float]) -> Pixels:
-        """World meters, y up, to fine pixels, y down."""
+        """World meters, y up, to oversampled pixels, y down."""
         x, y = point
-        half = SIDE * _FINE / 2
+        half = SIDE * _OVERSAMPLING / 2
         return half + float(x) * self._scale, half - float(y) * self._scale
 
     # -- the header --------------------------------------------------------------------------------------------------
@@ -201,31 +207,31 @@ class Renderer:
             x += text.get_width() + 14
 
     def _draw_legend(self, picture: pygame.Surface) -> None:
-        fine = pygame.Surface((SIDE * _FINE, HEADER * _FINE // 2))
-        fine.fill(_BACKGROUND)
-        y, words = fine.get_height() / 2, []
-        x = 20.0 * _FINE
+        canvas = pygame.Surface((SIDE * _OVERSAMPLING, HEADER * _OVERSAMPLING // 2))
+        canvas.fill(_BACKGROUND)
+        y, words = canvas.get_height() / 2, []
+        x = 20.0 * _OVERSAMPLING
 
         def name(word: str, *, after: float) -> None:
             nonlocal x
-            words.append((word, x / _FINE + after))
-            x += (after + self._font.size(word)[0] + 26) * _FINE
+            words.append((word, x / _OVERSAMPLING + after))
+            x += (after + self._font.size(word)[0] + 26) * _OVERSAMPLING
 
-        pygame.draw.circle(fine, _paler(_VEHICLE, 0.8), (x, y), 9 * _FINE)
-        _arrowhead(fine, (x, y), np.pi / 2, 8 * _FINE, _VEHICLE)
+        pygame.draw.circle(canvas, _paler(_VEHICLE, 0.8), (x, y), 9 * _OVERSAMPLING)
+        _arrowhead(canvas, (x, y), np.pi / 2, 8 * _OVERSAMPLING, _VEHICLE)
         name("vehicle, r_n' / 2", after=14)
-        pygame.draw.circle(fine, _paler(_GRID, -0.25), (x, y), 9 * _FINE, width=_FINE)
+        pygame.draw.circle(canvas, _paler(_GRID, -0.25), (x, y), 9 * _OVERSAMPLING, width=_OVERSAMPLING)
         name("r_n", after=14)
-        pygame.draw.line(fine, _LINK, (x - 9 * _FINE, y), (x + 9 * _FINE, y), width=2 * _FINE)
+        pygame.draw.line(canvas, _LINK, (x - 9 * _OVERSAMPLING, y), (x + 9 * _OVERSAMPLING, y), width=2 * _OVERSAMPLING)
         name("link", after=14)
-        _arrowhead(fine, (x, y), np.pi / 2, 8 * _FINE, _VIOLATION)
+        _arrowhead(canvas, (x, y), np.pi / 2, 8 * _OVERSAMPLING, _VIOLATION)
         name("violation", after=12)
-        pygame.draw.circle(fine, _OBSTACLE, (x, y), 9 * _FINE, width=2 * _FINE)
-        _square(fine, (x, y), 5 * _FINE)
+        pygame.draw.circle(canvas, _OBSTACLE, (x, y), 9 * _OVERSAMPLING, width=2 * _OVERSAMPLING)
+        _square(canvas, (x, y), 5 * _OVERSAMPLING)
         name("obstacle, r_o'", after=14)
-        _cross(fine, (x, y), 7 * _FINE)
+        _cross(canvas, (x, y), 7 * _OVERSAMPLING)
         name("waypoint", after=12)
-        picture.blit(pygame.transform.smoothscale(fine, (SIDE, HEADER // 2)), (0, HEADER // 2))
+        picture.blit(pygame.transform.smoothscale(canvas, (SIDE, HEADER // 2)), (0, HEADER // 2))
         for word, left in words:
             text = self._font.render(word, True, _TEXT)
             picture.blit(text, (left, HEADER // 2 + (HEADER // 2 - text.get_height()) / 2 + 1))
@@ -240,8 +246,8 @@ def _arrowhead(canvas: pygame.Surface, center: Pixels, heading: float, size: flo
 
 def _cross(canvas: pygame.Surface, center: Pixels, size: float) -> None:
     x, y = center
-    pygame.draw.line(canvas, _WAYPOINT, (x - size, y), (x + size, y), width=3 * _FINE)
-    pygame.draw.line(canvas, _WAYPOINT, (x, y - size), (x, y + size), width=3 * _FINE)
+    pygame.draw.line(canvas, _WAYPOINT, (x - size, y), (x + size, y), width=3 * _OVERSAMPLING)
+    pygame.draw.line(canvas, _WAYPOINT, (x, y - size), (x, y + size), width=3 * _OVERSAMPLING)
 
 
 def _square(canvas: pygame.Surface, center: Pixels, half: float) -> None:

@@ -50,7 +50,7 @@ def make_vec_env(
 def flatten(env: ParallelEnv, n_copies: int = 1, num_cpus: int = 0, seed: int | None = None) -> ParameterSharingVecEnv:
     """Any PettingZoo parallel env whose agents share their spaces, copied and flattened into one SB3 vector env.
 
-    :param env: the env; all of its agents must live as long as the episode
+    :param env: the env; all agents of an episode must live until its end
     :param n_copies: number of independent copies
     :param num_cpus: worker processes; 0 and 1 keep everything in this process
     :param seed: seeds all copies, each with a stream of its own
@@ -148,7 +148,7 @@ class ParameterSharingVecEnv(SB3VecEnvWrapper):
             yield
         except (EOFError, OSError) as error:
             if not self._has_workers:
-                raise  # the env's own
+                raise  # an error of the env itself
             ending = wait([proc.sentinel for proc in self.venv.procs], timeout=5)
             for proc in self.venv.procs:
                 if proc.sentinel in ending:

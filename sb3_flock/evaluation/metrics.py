@@ -195,7 +195,8 @@ class _Minimum(EpisodeMetric):
 class TrackingError(_Mean):
     """Mean distance to the waypoint in the steady state."""
 
-    name, unit, better, column = "tracking_error", "m", "lower", "tracking"
+    name, unit, better = "tracking_error", "m", "lower"
+    column: ClassVar[str | None] = "tracking"
     description = "mean distance vehicle to waypoint over vehicles and steady-state steps [m]"
 
     def value(self, step: Step) -> Values:
@@ -206,7 +207,8 @@ class TrackingError(_Mean):
 class EpisodeTracking(TrackingError):
     """Mean distance to the waypoint in the whole episode."""
 
-    name, column = "tracking_error_episode", None
+    name = "tracking_error_episode"
+    column: ClassVar[str | None] = None
     description = "the same over the whole episode [m]"
     steady_state_only = False
 
@@ -432,9 +434,9 @@ def _summarize(name: str, defined: Values) -> Metric:
     return Metric(float(defined.mean()), float(low), float(high), len(defined), worst)
 
 
-def columns() -> dict[str, type[EpisodeMetric]]:
-    """The metrics of narrow tables by name: those with a ``column``."""
-    return {name: metric for name, metric in METRICS.items() if metric.column is not None}
+def columns() -> dict[str, str]:
+    """Headings of narrow tables by metric: the metrics with a ``column``."""
+    return {name: metric.column for name, metric in METRICS.items() if metric.column is not None}
 
 
 def score(means: Mapping[str, float]) -> float:

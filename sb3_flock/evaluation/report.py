@@ -57,20 +57,19 @@ def plain_table() -> Table:
 
 def add_short_columns(table: Table) -> None:
     """Add the columns of narrow tables, those of :func:`~sb3_flock.evaluation.metrics.columns`."""
-    for metric in columns().values():
-        table.add_column(metric.column, justify="right", no_wrap=True)
+    for heading in columns().values():
+        table.add_column(heading, justify="right", no_wrap=True)
 
 
 def short_cells(means: Mapping[str, float | None], missing: str = "-") -> list[str]:
     """The cells of these columns: each metric's mean, or ``missing`` where there is none (``None``, NaN)."""
-    values = [(means.get(name), metric) for name, metric in columns().items()]
+    values = [(means.get(name), METRICS[name]) for name in columns()]
     return [missing if value is None or np.isnan(value) else metric.format(value) for value, metric in values]
 
 
 def short_summary(means: Mapping[str, float | None]) -> str:
     """These columns as one line, such as ``tracking 0.087, connected 99.20%``."""
-    headings = [metric.column for metric in columns().values()]
-    return ", ".join(f"{heading} {cell}" for heading, cell in zip(headings, short_cells(means), strict=True))
+    return ", ".join(f"{heading} {cell}" for heading, cell in zip(columns().values(), short_cells(means), strict=True))
 
 
 def metrics_table(metrics: dict[str, Metric], scenario: Scenario) -> Table:

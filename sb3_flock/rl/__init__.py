@@ -1,1 +1,1 @@
-"""The Stable-Baselines3 plugin: features extractor, policies, callbacks and the training function."""
+"""The Stable-Baselines3 plugin: features extractor, policies, replay buffer, algorithm, callbacks and the registry."""

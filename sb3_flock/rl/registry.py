@@ -161,6 +161,7 @@ def build_model(settings: ModelSettings, env: VecEnv) -> OffPolicyAlgorithm:
         "mirror_augmentation": algorithm.mirror_augmentation is not False,
         "store_expert_actions": algorithm.bc_coef > 0,
     }
+    options: dict[str, Any] = {"bc_coef": algorithm.bc_coef} if spec.has_bc else {}
     return model_class(
         policy_class,
         env,
@@ -179,7 +180,7 @@ def build_model(settings: ModelSettings, env: VecEnv) -> OffPolicyAlgorithm:
         policy_kwargs=policy_kwargs(settings),
         seed=settings.seed,
         device=settings.device,
-        **({"bc_coef": algorithm.bc_coef} if spec.has_bc else {}),
+        **options,
     )
 
 

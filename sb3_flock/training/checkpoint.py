@@ -1,6 +1,6 @@
-"""CheckpointCallback: everything that decides how a training goes on, in one zip.
+"""Checkpoints: everything that a training depends on when it continues, in one zip.
 
-``rl_model_<steps>_steps.zip`` is a model as SB3 saves it, with our JSON member (:mod:`sb3_flock.serialization.save`), and and the
+``rl_model_<steps>_steps.zip`` is a model as SB3 saves it, with our JSON member (:mod:`sb3_flock.serialization.save`), and the
 state of the training: replay buffer, current episodes, random streams, callbacks. That state is plain values in
 ``training.json`` and arrays in ``training/*.npy``: reading it runs no code.
 """

@@ -34,7 +34,13 @@ from sb3_flock.serialization.save import save_model
 from sb3_flock.serialization.yaml_io import load_config
 from sb3_flock.settings import RunError, SettingsError
 from sb3_flock.sim import Scenario, World, episode_rng
-from sb3_flock.training.checkpoint import LoadedCheckpoint, Stateful, newest_checkpoint, reproducibility_warnings
+from sb3_flock.training.checkpoint import (
+    LoadedCheckpoint,
+    Stateful,
+    newest_checkpoint,
+    reproducibility_warnings,
+    save_checkpoint,
+)
 from sb3_flock.training.checkpoint_callback import CheckpointCallback
 from sb3_flock.training.eval_callback import FlockEvalCallback
 from sb3_flock.training.logger import make_logger, quiet_writer_thread
@@ -224,7 +230,15 @@ def _run(
         StopOnNonFiniteLoss(),
         progress,
         *callbacks,
-        CheckpointCallback(folder, config.save_freq, config, config.keep_checkpoints, stateful, checkpoint, signals),
+        CheckpointCallback(
+            folder,
+            config.save_freq,
+            config.keep_checkpoints,
+            lambda model, path, parts: save_checkpoint(model, path, config, parts),
+            stateful,
+            checkpoint,
+            signals,
+        ),
     ]
     if model.action_noise is not None:
         parts.append(LinearNoiseDecay(config.algorithm.action_noise_std, config.algorithm.final_action_noise_std))

@@ -126,14 +126,15 @@ def _circle(axes: Axes, center: NDArray[np.float64], radius: float, color: str) 
 
 def plot_observation(scenario: Scenario, n_neighbors: int = 10, seed: int = 0) -> Figure:
     """Neighbors in a vehicle's body frame beside its neighbor channel (the paper's observation figure)."""
-    world = World(scenario.replace(n_vehicles=n_neighbors + 1, n_obstacles=0))
+    scenario = scenario.replace(n_vehicles=n_neighbors + 1, n_obstacles=0)
+    world = World(scenario)
     world.reset([episode_rng(seed, 0)])
     rng, reach = np.random.default_rng(seed), scenario.link_range
     angles, distances = rng.uniform(-np.pi, np.pi, n_neighbors), reach * np.sqrt(rng.uniform(0.05, 0.98, n_neighbors))
     offsets = distances[:, None] * np.stack((np.cos(angles), np.sin(angles)), axis=-1)
     world.positions = np.concatenate((np.zeros((1, 2)), offsets))[None]
     world.headings = np.zeros((1, n_neighbors + 1))
-    channel = observe(world.sense(), world.scenario)[0, 0, 0]
+    channel = observe(world.sense(), scenario)[0, 0, 0]
 
     figure, (left, right) = new_figure(8.0, 3.8, columns=2)
     radius = scenario.channel_radii[0]

@@ -24,7 +24,7 @@ except ImportError:
 _PANEL = 224
 """Width of the panel beside the arena [pixels]."""
 _TILE = 152
-"""Side of a channel's picture [pixels]."""
+"""Side of a channel's image [pixels]."""
 _GRAB_RADIUS = 14
 """Distance within which a press takes hold of the waypoint or an obstacle [pixels]."""
 _MAX_CYCLES = 20_000
@@ -108,7 +108,7 @@ class Game:
         if event.type == pygame.QUIT:
             self._quit()
         elif event.type == pygame.KEYDOWN:
-            pressed = pygame.K_PLUS if event.unicode == "+" else event.key  # on whatever key a layout has it
+            pressed = pygame.K_PLUS if event.unicode == "+" else event.key  # keyboard layouts differ
             self._keys.get(pressed, lambda: None)()
         elif event.type == pygame.MOUSEBUTTONDOWN and event.button == 1 and self._is_in_picture(event.pos):
             self._press(self.renderer.position_at(event.pos))

@@ -24,7 +24,7 @@ Frame = NDArray[np.uint8]
 _MAX_FPS = 50
 """Largest frame rate; at higher speeds steps are left out. A GIF shows no more."""
 _COLORS = 64
-"""Colors of a GIF, chosen once from frames all over the flight."""
+"""Colors of a GIF, chosen once from frames of the whole episode."""
 
 
 def render(
@@ -102,17 +102,17 @@ def _write_gif(path: Path, frames: Iterator[Frame], fps: float, title: str) -> N
 
     from sb3_flock.envs.rendering import PALETTE
 
-    frames = [Image.fromarray(frame) for frame in frames]
-    some = frames[:: max(1, len(frames) // 8)]
+    images = [Image.fromarray(frame) for frame in frames]
+    some = images[:: max(1, len(images) // 8)]
     width, height = some[0].size
     together = Image.new("RGB", (width, height * (len(some) + 1)))
-    for place, frame in enumerate(some):
-        together.paste(frame, (0, place * height))
+    for place, image in enumerate(some):
+        together.paste(image, (0, place * height))
     band = height // len(PALETTE)
-    for place, color in enumerate(PALETTE):  # colors that are seldom there are kept as well
+    for place, color in enumerate(PALETTE):  # rare colors stay in the palette
         together.paste(color, (0, height * len(some) + place * band, width, height * len(some) + (place + 1) * band))
     palette = together.quantize(_COLORS, dither=Image.Dither.NONE)
-    first, *others = (frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
+    first, *others = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images)
     first.save(path, "GIF", save_all=True, append_images=others, duration=round(1000 / fps), loop=0)
 
 
