@@ -20,7 +20,7 @@ class Controller(ABC):
     One instance drives one batch of flocks at a time. The defaults are those of a controller without memory.
     """
 
-    def reset(self, rngs: Sequence[Generator], scenario: Scenario) -> None:
+    def reset(self, rngs: Sequence[Generator], scenario: Scenario) -> None:  # noqa: B027 - a no-op by default
         """Start episodes.
 
         :param rngs: one generator a flock, which a controller that draws random numbers uses
@@ -39,7 +39,7 @@ class Controller(ABC):
         """The memory of the current episodes: plain values and arrays."""
         return {}
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:  # noqa: B027 - a no-op by default
         """Restore :meth:`state_dict`."""
 
 

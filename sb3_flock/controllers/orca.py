@@ -33,7 +33,8 @@ class Orca(Controller):
     """The velocity nearest to one towards the waypoint that collides with no sensed body over the time horizon.
 
     Every vehicle solves its own problem from what it senses: in RVO2's plane, the vehicle and the bodies in its range are
-    placed out of range of all other vehicles' problems. A vehicle's disc is half the minimum separation, an obstacle's the rest of its own.
+    placed out of range of all other vehicles' problems. A vehicle's disc is half the minimum separation, an obstacle's the
+    rest of its own.
     ORCA does not keep links, and assumes holonomic discs: :func:`steer` turns its velocity into a unicycle's actions.
 
     :param gains: the default is the best of a search on separate episodes (``tests/benchmarks/tune_controllers.py``)

@@ -64,9 +64,9 @@ class OnnxPolicy(nn.Module):
     number, 2)`` and of the waypoint ``(2,)``, all in the body frame [m] (forward is +x, left is +y) and float64. Bodies
     out of sensing range are ignored. The output is ``(2,)``: speed [m/s] and turn rate [rad/s].
 
-    With motion channels the graph also takes what was measured ``motion_lag`` ago, ``previous_neighbors``, ``previous_obstacles`` and
-    ``previous_waypoint`` in the body frame of that time, and ``ego_motion`` ``(3,)``: the vehicle's present position in that frame [m, m]
-    and its turn since [rad]. Before ``motion_lag`` has passed these are the first measurement.
+    With motion channels the graph also takes what was measured ``motion_lag`` ago in the body frame of that time,
+    ``previous_neighbors``, ``previous_obstacles`` and ``previous_waypoint``, and ``ego_motion`` ``(3,)``: the vehicle's present
+    position in that frame [m, m] and its turn since [rad]. Before ``motion_lag`` has passed these are the first measurement.
 
     All computations are in float64: float32 is off by 1e-5 rad/s where a policy is steep, and is hardly faster.
 
@@ -153,8 +153,8 @@ def _norm(vectors: th.Tensor) -> th.Tensor:
 def export(policy: LoadedPolicy, path: str | Path, n_samples: int = 1000, seed: int = 0) -> ExportResult:
     """Write a policy as ONNX, and check that the graph acts as the policy does.
 
-    The graph is that of :class:`OnnxPolicy`, its inputs are :data:`INPUTS`, with motion channels :data:`PREVIOUS_INPUTS` as well, its
-    output is ``action``. Ranges, sampling period and units are in the file's metadata under ``sb3_flock``, as JSON.
+    The graph is that of :class:`OnnxPolicy`. Its inputs are :data:`INPUTS`, with motion channels :data:`PREVIOUS_INPUTS` as
+    well; its output is ``action``. Ranges, sampling period and units are in the file's metadata under ``sb3_flock``, as JSON.
 
     :param path: the file, which is written whole or not at all
     :param n_samples: number of random sample inputs on which the graph is compared with ``predict``
@@ -214,7 +214,8 @@ def _metadata(policy: LoadedPolicy) -> dict[str, Any]:
     names = ("link_range", "detection_range", "neighbor_separation", "obstacle_separation", "time_step", "max_speed")
     inputs = "positions in the body frame [m], forward +x, left +y: neighbors (any, 2), obstacles (any, 2), waypoint (2,)"
     if scenario.motion_lag:
-        inputs += "; previous_...: those of motion_lag [s] ago, in the frame of that time; ego_motion (3,): position in it, turn [rad]"
+        inputs += "; previous_...: those of motion_lag [s] ago, in the frame of that time"
+        inputs += "; ego_motion (3,): present position in that frame [m], turn since [rad]"
     return {
         **policy.describe(),
         "policy": policy.path.name,

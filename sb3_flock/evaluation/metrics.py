@@ -204,7 +204,7 @@ class TrackingError(_Mean):
 
 
 @register_metric
-class EpisodeTracking(TrackingError):
+class TrackingErrorEpisode(TrackingError):  # noqa: N818 - a metric, not an exception
     """Mean distance to the waypoint in the whole episode."""
 
     name = "tracking_error_episode"

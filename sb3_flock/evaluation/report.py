@@ -47,7 +47,7 @@ PAPER: dict[tuple[int, int], dict[str, dict[str, float]]] = {
         },
     },
 }
-"""The figures of Lyu et al. (2018) by (vehicles, obstacles), table and metric; (3, 1) is in both tables, with different figures."""
+"""The figures of Lyu et al. (2018) by (vehicles, obstacles), table and metric; both tables have (3, 1), and differ there."""
 
 
 def plain_table() -> Table:
@@ -73,7 +73,7 @@ def short_summary(means: Mapping[str, float | None]) -> str:
 
 
 def metrics_table(metrics: dict[str, Metric], scenario: Scenario) -> Table:
-    """All metrics with their intervals, beside the paper's figures for the same numbers of vehicles and obstacles, if it has any."""
+    """All metrics with their intervals, beside the paper's figures for the same numbers of bodies, if it has any."""
     paper = PAPER.get((scenario.n_vehicles, scenario.n_obstacles), {})
     table = plain_table()
     table.add_column("metric", no_wrap=True)

@@ -204,8 +204,8 @@ def _all_pairs(positions: NDArray[np.float64], bodies: NDArray[np.float64], sens
 
 
 def _pairs_by_cell(positions: NDArray[np.float64], bodies: NDArray[np.float64], sensing_range: float) -> Pairs:
-    """Square cells of side ``sensing_range``, numbered flock by flock and column by column: a body in range of a vehicle lies in one
-    of three columns, in three cells of consecutive numbers each, so sorted bodies are found by bisection."""
+    """Square cells of side ``sensing_range``, numbered flock by flock and column by column: a body in range of a vehicle lies
+    in one of three columns, in three cells of consecutive numbers each, so sorted bodies are found by bisection."""
     n_flocks, n_bodies, _ = bodies.shape
     corner = np.minimum(positions.min((0, 1)), bodies.min((0, 1), initial=np.inf))
     span = np.maximum(positions.max((0, 1)), bodies.max((0, 1), initial=-np.inf)) - corner
