@@ -125,11 +125,11 @@ class TrainingConfig(ModelSettings, TaskConfig):
     eval_freq: Count = Field(10_000, description="transitions between evaluations; 0: none")
     n_eval_episodes: int = Field(100, ge=1, le=1_000_000, description="episodes of an evaluation, the same ones every time")
     n_test_episodes: int = Field(
-        1000, ge=1, le=1_000_000, description="episodes of the table that `sb3-flock train` prints at the end"
+        1000, ge=1, le=1_000_000, description="episodes of the final evaluation of the best model, on a separate seed"
     )
     save_freq: Count = Field(25_000, description="transitions between checkpoints; 0: none")
     keep_checkpoints: int = Field(
-        2, ge=1, le=1_000_000, description="number of newest checkpoints to keep; `train --resume` continues from the newest"
+        2, ge=1, le=1_000_000, description="number of newest checkpoints to keep; a resumed training continues from the newest"
     )
     init_from: str | None = Field(None, description="policy (zip or run folder) with the initial weights; null: random")
     output_dir: str = Field("runs", description="folder in which run folders are created")

@@ -278,7 +278,7 @@ def _faults_as_run_errors(folder: Path) -> Iterator[None]:
 
 def _how_to_resume(folder: Path) -> str:
     saved = checkpoint_paths(folder)
-    return f"{saved[-1].name if saved else 'nothing'} is saved; to continue: sb3-flock train --resume {folder}"
+    return f"{saved[-1].name if saved else 'nothing'} is saved; resume {folder} to continue"
 
 
 def _build(config: TrainingConfig, env: VecEnv) -> OffPolicyAlgorithm:

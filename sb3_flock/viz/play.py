@@ -251,7 +251,7 @@ def play(policy: Any, scenario: Scenario, seed: int = 0, speed: float = 2.0) -> 
         window = pygame.display.set_mode((SIDE + _PANEL, HEADER + SIDE))
     except pygame.error as error:
         pygame.display.quit()
-        raise SettingsError(f"play: no display to open a window on ({error}); `sb3-flock render` needs none") from None
+        raise SettingsError(f"play: no display to open a window on ({error}); a video needs none") from None
     try:
         game, clock = Game(policy, scenario, seed), pygame.time.Clock()
         due = 0.0  # steps to simulate
