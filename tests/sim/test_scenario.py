@@ -68,3 +68,10 @@ def test_every_parameter_has_a_description():
     for settings in (Scenario, RewardWeights):
         for name, field in settings.model_fields.items():
             assert field.description, name
+
+
+def test_equal_scenarios_are_one_key():
+    known = {Scenario(): "default", Scenario(reward={"lambda_": 0.5}): "half"}
+    assert known[Scenario().replace(n_vehicles=5).replace(n_vehicles=3)] == "default"
+    assert known[Scenario(reward=RewardWeights(lambda_=0.5))] == "half"
+    assert Scenario(n_vehicles=4) not in known
