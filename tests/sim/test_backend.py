@@ -9,7 +9,7 @@ from sb3_flock.sim.backend import compiled
 
 @pytest.fixture
 def _fresh():
-    """The decision for or against numba is kept; here it is taken anew."""
+    """``compiled`` caches its result: each of these tests starts and ends without one."""
     compiled.cache_clear()
     yield
     compiled.cache_clear()
