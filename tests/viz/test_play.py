@@ -217,14 +217,18 @@ def test_a_real_window_with_a_real_mouse_and_keys(screen, tmp_path):
         xdotool("mousedown", 1)
         point_at(*there)
         xdotool("mouseup", 1)
-        picture = ImageGrab.grab(xdisplay=screen)
-        picture.save(tmp_path / "window.png")
-        colors = np.asarray(picture)
-        corner = np.argwhere((colors == 255).all(-1)).min(0)  # of the window on the black screen
 
         def color_at(x, y):
+            colors = np.asarray(picture)
+            corner = np.argwhere((colors == 255).all(-1)).min(0)  # of the window on the black screen
             return tuple(colors[corner[0] + round(y), corner[1] + round(x)].tolist())
 
+        deadline = time.monotonic() + 30
+        picture = ImageGrab.grab(xdisplay=screen)
+        while color_at(*there) != (0, 0, 0) and time.monotonic() < deadline:  # the window draws 30 times a second
+            time.sleep(0.05)
+            picture = ImageGrab.grab(xdisplay=screen)
+        picture.save(tmp_path / "window.png")
         assert color_at(60, HEADER + 60) == (204, 121, 167)  # the obstacle
         assert color_at(*there) == (0, 0, 0)  # the waypoint's cross
         assert color_at(*here) != (0, 0, 0)
