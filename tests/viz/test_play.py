@@ -176,8 +176,23 @@ def screen(monkeypatch):
     server.wait()
 
 
+def color_at(screen, pixels):
+    """The color of a pixel of the window, which alone is on the black screen."""
+    colors = np.asarray(ImageGrab.grab(xdisplay=screen))
+    corner = np.argwhere((colors == 255).all(-1)).min(0)
+    return tuple(colors[corner[0] + round(pixels[1]), corner[1] + round(pixels[0])].tolist())
+
+
+def wait_for_color(screen, pixels, color, seconds=30):
+    """The window draws 30 times a second, or less often on a busy machine."""
+    deadline = time.monotonic() + seconds
+    while (found := color_at(screen, pixels)) != color:
+        assert time.monotonic() < deadline, found
+        time.sleep(0.05)
+
+
 @pytest.mark.skipif(not (shutil.which("Xvfb") and shutil.which("xdotool")), reason="needs Xvfb and xdotool")
-def test_a_real_window_with_a_real_mouse_and_keys(screen, tmp_path):
+def test_a_real_window_with_a_real_mouse_and_keys(screen):
     def xdotool(*words):
         return subprocess.run(["xdotool", *map(str, words)], check=False, capture_output=True, text=True).stdout.strip()
 
@@ -217,21 +232,9 @@ def test_a_real_window_with_a_real_mouse_and_keys(screen, tmp_path):
         xdotool("mousedown", 1)
         point_at(*there)
         xdotool("mouseup", 1)
-
-        def color_at(x, y):
-            colors = np.asarray(picture)
-            corner = np.argwhere((colors == 255).all(-1)).min(0)  # of the window on the black screen
-            return tuple(colors[corner[0] + round(y), corner[1] + round(x)].tolist())
-
-        deadline = time.monotonic() + 30
-        picture = ImageGrab.grab(xdisplay=screen)
-        while color_at(*there) != (0, 0, 0) and time.monotonic() < deadline:  # the window draws 30 times a second
-            time.sleep(0.05)
-            picture = ImageGrab.grab(xdisplay=screen)
-        picture.save(tmp_path / "window.png")
-        assert color_at(60, HEADER + 60) == (204, 121, 167)  # the obstacle
-        assert color_at(*there) == (0, 0, 0)  # the waypoint's cross
-        assert color_at(*here) != (0, 0, 0)
+        wait_for_color(screen, there, (0, 0, 0))  # the waypoint's cross
+        wait_for_color(screen, (60, HEADER + 60), (204, 121, 167))  # the obstacle
+        assert color_at(screen, here) != (0, 0, 0)
         point_at(60, HEADER + 60)
         xdotool("click", 1)
         wait_for("1 obstacle,")
