@@ -19,12 +19,12 @@ _ARGUMENTS = (
 
 
 class Browser:
-    """One page, and what its console says."""
+    """One page and its console."""
 
     def __enter__(self) -> "Browser":
         self._profile = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
         self._driver = subprocess.Popen(["chromedriver", "--port=0"], stdout=subprocess.PIPE, text=True)
-        for line in self._driver.stdout:  # it says which port it found
+        for line in self._driver.stdout:  # the line with the port that the driver found
             if "started successfully on port" in line:
                 self._address = f"http://127.0.0.1:{line.split()[-1].rstrip('.')}/session"
                 break

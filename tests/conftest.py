@@ -27,6 +27,20 @@ def _no_worker_outlives_its_test():
 
 
 @pytest.fixture
+def restored():
+    """Call it with registries of the package: what a test registers there is removed afterwards."""
+    saved = []
+
+    def keep(*registries):
+        saved.extend((registry, dict(registry)) for registry in registries)
+
+    yield keep
+    for registry, entries in reversed(saved):
+        registry.clear()
+        registry.update(entries)
+
+
+@pytest.fixture
 def scenario():
     return Scenario()
 

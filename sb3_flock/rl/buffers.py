@@ -63,7 +63,10 @@ class CompactReplayBuffer(ReplayBuffer):
     ) -> None:
         if renamed:  # arguments of the previous release
             options, names = rename_fields("CompactReplayBuffer", renamed)
+            given = {"mirror_augmentation": mirror_augmentation, "store_expert_actions": store_expert_actions}
             for old, new in names:
+                if given[new]:
+                    raise TypeError(f"CompactReplayBuffer got {new} and its old name {old}")
                 warn_renamed(f"CompactReplayBuffer: {old}", new)
             mirror_augmentation = options.pop("mirror_augmentation", mirror_augmentation)
             store_expert_actions = options.pop("store_expert_actions", store_expert_actions)

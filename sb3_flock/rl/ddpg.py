@@ -10,7 +10,7 @@ from stable_baselines3 import DDPG
 from torch.nn import functional as F  # noqa: N812 - torch's name for it
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
-from sb3_flock._renamed import FIELDS
+from sb3_flock._renamed import FIELDS, warn_renamed
 from sb3_flock.rl.torch_layers import FlockCNN
 from sb3_flock.settings import SettingsError
 
@@ -30,6 +30,12 @@ class FlockDDPG(DDPG):
     """
 
     def __init__(self, *args: Any, bc_coef: float = 0.0, **kwargs: Any) -> None:
+        for old, new in FIELDS["FlockDDPG"].items():  # arguments of the previous release
+            if old in kwargs:
+                if bc_coef:
+                    raise TypeError(f"FlockDDPG got {new} and its old name {old}")
+                warn_renamed(f"FlockDDPG: {old}", new)
+                bc_coef = kwargs.pop(old)
         self.bc_coef = bc_coef
         super().__init__(*args, **kwargs)
 

@@ -80,6 +80,10 @@ class RewardWeights(Settings):
                 )
         return weights
 
+    def __hash__(self) -> int:
+        values = {name: getattr(self, name) for name in type(self).model_fields}
+        return hash((frozenset(values.pop("extra_terms").items()), *values.values()))
+
 
 def reward_terms(
     sensing: Sensing, actions: NDArray[np.float64], weights: RewardWeights, ranges: SensingSettings

@@ -7,7 +7,8 @@ from gymnasium.utils.env_checker import data_equivalence
 
 from sb3_flock import flocking_v0
 from sb3_flock.settings import SettingsError
-from sb3_flock.sim import Scenario
+from sb3_flock.sim import Channel, Scenario, register_channel
+from sb3_flock.sim.observation import CHANNELS
 
 with warnings.catch_warnings():  # importing PettingZoo's tests imports its deprecated modules
     warnings.simplefilter("ignore", DeprecationWarning)
@@ -29,7 +30,7 @@ VARIANTS = [
 ]
 
 
-def fly(env, seed, episodes, action_seed=0):
+def episodes_of(env, seed, episodes, action_seed=0):
     """Everything an env returns over several episodes, with the same actions every time."""
     rng = np.random.default_rng(action_seed)
     seen = [env.reset(seed=seed)]
@@ -63,9 +64,9 @@ def test_pettingzoos_cycle_and_render_tests_pass():
 
 @pytest.mark.parametrize("kwargs", VARIANTS)
 def test_several_episodes_repeat_from_one_seed(kwargs):
-    first, second = (fly(flocking_v0.parallel_env(**kwargs), 11, episodes=3) for _ in range(2))
+    first, second = (episodes_of(flocking_v0.parallel_env(**kwargs), 11, episodes=3) for _ in range(2))
     assert data_equivalence(first, second)
-    other = fly(flocking_v0.parallel_env(**kwargs), 12, episodes=1)
+    other = episodes_of(flocking_v0.parallel_env(**kwargs), 12, episodes=1)
     assert not data_equivalence(first[0][0], other[0][0])
 
 
@@ -101,7 +102,36 @@ def test_spaces_do_not_depend_on_the_number_of_bodies():
     np.testing.assert_allclose(action_space.high, [0.15, np.pi], rtol=1e-6)
 
 
-def test_infos_tell_neighbors_terms_and_metrics():
+def test_a_registered_channel_is_part_of_the_observation_space(restored):
+    restored(CHANNELS)
+    register_channel(
+        Channel(
+            "obstacles_ahead",
+            "obstacles",
+            lambda settings: settings.detection_range,
+            lambda positions: positions[..., 0] > 0,
+        )
+    )
+    kwargs = {"extra_channels": ["obstacles_ahead"], "motion_lag": 0.2, "n_obstacles": 3, "obstacle_arena": 0.4}
+    parallel_api_test(flocking_v0.parallel_env(**kwargs), num_cycles=50)
+    env = flocking_v0.parallel_env(**kwargs, arena=0.3)
+    space = env.observation_space("vehicle_0")
+    assert space.shape == (8, 11, 11)
+    assert (space.low[:4] == 0.0).all()
+    assert (space.low[4:] < 0.0).all()
+    observations, _ = env.reset(seed=0)
+    largest, smallest = np.zeros(8), np.zeros(8)
+    for _ in range(20):
+        observations, *_ = env.step({agent: np.array([0.1, 1.0], dtype=np.float32) for agent in env.agents})
+        for observation in observations.values():
+            assert space.contains(observation)
+            largest = np.maximum(largest, observation.max((1, 2)))
+            smallest = np.minimum(smallest, observation.min((1, 2)))
+    assert largest[3] > 0.5
+    assert smallest[7] < -0.01
+
+
+def test_infos_hold_neighbors_terms_and_metrics():
     env = flocking_v0.parallel_env(n_vehicles=8, n_obstacles=3, arena=0.3, obstacle_arena=0.5, neighbor_separation=0.05)
     env.reset(seed=3)
     scenario = env.scenario
@@ -166,6 +196,6 @@ def test_observations_are_fresh_arrays():
         ({"render_mode": "ansi"}, "render_mode = 'ansi'"),
     ],
 )
-def test_bad_arguments_are_told_in_one_line(kwargs, message):
+def test_bad_arguments_are_refused_in_one_line(kwargs, message):
     with pytest.raises(SettingsError, match=message):
         flocking_v0.parallel_env(**kwargs)

@@ -19,7 +19,7 @@ def three_flocks():
     return MultiFlockEnv([parallel_env(CROWDED, n_vehicles=n) for n in (2, 5, 1)])
 
 
-def test_it_is_a_parallel_env_that_begins_anew_after_its_end():
+def test_it_is_a_parallel_env_that_can_be_reset_after_its_end():
     env = three_flocks()
     parallel_api_test(env, num_cycles=20)
     parallel_seed_test(three_flocks, num_cycles=8)
@@ -27,7 +27,7 @@ def test_it_is_a_parallel_env_that_begins_anew_after_its_end():
     assert len(env.possible_agents) == 8
 
 
-def test_a_flock_flies_as_it_does_alone():
+def test_a_flock_moves_as_it_does_alone():
     env = three_flocks()
     env.reset(seed=3)
     alone = parallel_env(CROWDED, n_vehicles=5)
@@ -59,7 +59,7 @@ def test_rewards_are_mixed_within_a_flock():
     assert any(len(info["neighbors"]) for info in infos[2:7])
 
 
-def test_its_state_goes_on_to_the_last_bit():
+def test_a_state_continues_to_the_last_bit():
     one, other = flatten(three_flocks(), 2, seed=4), flatten(three_flocks(), 2, seed=5)
     rng = np.random.default_rng(1)
     one.reset()

@@ -50,10 +50,10 @@ def test_a_vehicle_leaves_a_trail_until_the_next_episode():
     start = env.render()
     for _ in range(10):
         env.step({"vehicle_0": np.array([0.15, 0.0], dtype=np.float32)})
-        moved = env.render()
+        later = env.render()
     trail = (128, 184, 216)
     assert not len(pixels_of(start, trail))
-    assert len(pixels_of(moved, trail))
+    assert len(pixels_of(later, trail))
     env.reset(seed=0)
     np.testing.assert_array_equal(env.render(), start)
 

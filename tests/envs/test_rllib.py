@@ -1,4 +1,4 @@
-"""RLlib's users find the environment in their own wrapper."""
+"""The environment works in RLlib's wrapper."""
 
 import pytest
 

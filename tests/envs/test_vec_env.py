@@ -1,4 +1,4 @@
-"""The gaps in the way from SuperSuit to SB3, each pinned by a test that fails without the adapter's handling."""
+"""The defects between SuperSuit and SB3, each with a test that fails without the adapter's handling."""
 
 import os
 import signal
@@ -212,7 +212,7 @@ def test_vec_monitor_and_eval_callback_work(tmp_path):
     assert np.isfinite(mean)
 
 
-def test_a_flight_can_be_recorded_as_video(tmp_path):
+def test_an_episode_can_be_recorded_as_video(tmp_path):
     pytest.importorskip("moviepy")
     env = make_vec_env(SCENARIO, n_flocks=1, seed=0, render_mode="rgb_array")
     recorder = VecVideoRecorder(env, str(tmp_path), record_video_trigger=lambda step: step == 0, video_length=4)
@@ -245,31 +245,31 @@ class HasNoDisk(flocking_v0.parallel_env):
         raise OSError("no disk")
 
 
-def test_an_envs_own_error_is_not_taken_for_a_dead_worker():
+def test_an_envs_own_error_is_not_reported_as_a_dead_worker():
     env = flatten(HasNoDisk(SCENARIO), seed=0)
     env.reset()
     with pytest.raises(OSError, match="no disk"):
         env.step(np.zeros((3, 2), dtype=np.float32))
 
 
-class SaysGoodbye(flocking_v0.parallel_env):
+class MarksItsEnd(flocking_v0.parallel_env):
     """Leaves a file named for its process when it is closed."""
 
     def close(self):
-        if getattr(self, "farewells", None):
-            (self.farewells / str(os.getpid())).touch()
+        if getattr(self, "closed_in", None):
+            (self.closed_in / str(os.getpid())).touch()
         super().close()
 
 
 def test_closing_closes_the_workers_envs(tmp_path):
-    template = SaysGoodbye(SCENARIO)
-    template.farewells = tmp_path
+    template = MarksItsEnd(SCENARIO)
+    template.closed_in = tmp_path
     env = flatten(template, n_copies=2, num_cpus=2, seed=0)
     env.reset()
     procs = env.venv.procs
     started = time.monotonic()
     env.close()
-    env.close()  # twice is fine
+    env.close()  # a second time has no effect
     assert time.monotonic() - started < 10
     assert {path.name for path in tmp_path.iterdir()} >= {str(proc.pid) for proc in procs}
     assert not any(proc.is_alive() for proc in procs)
@@ -286,15 +286,15 @@ def test_slots_are_ordered_copy_by_copy_and_actions_go_to_their_vehicle():
     actions[4] = (0.15, 0.0)  # the second flock's vehicle_1
     env.step(actions)
     after = [copy.world.positions[0] for copy in env.get_attr("unwrapped", indices=[0, 3])]
-    moved = [np.linalg.norm(a - b, axis=-1) > 0 for a, b in zip(after, before, strict=True)]
-    assert moved[0].tolist() == [False, False, False]
-    assert moved[1].tolist() == [False, True, False]
+    has_moved = [np.linalg.norm(a - b, axis=-1) > 0 for a, b in zip(after, before, strict=True)]
+    assert has_moved[0].tolist() == [False, False, False]
+    assert has_moved[1].tolist() == [False, True, False]
 
 
 BAD_COUNTS = [({"n_flocks": 0}, "n_flocks = 0"), ({"num_cpus": -1}, "num_cpus = -1"), ({"seed": -1}, "seed = -1")]
 
 
 @pytest.mark.parametrize(("kwargs", "name"), BAD_COUNTS)
-def test_bad_counts_are_told_in_one_line(kwargs, name):
+def test_bad_counts_are_refused_in_one_line(kwargs, name):
     with pytest.raises(SettingsError, match=name):
         make_vec_env(SCENARIO, **kwargs)

@@ -1,10 +1,20 @@
+import io
+import json
+
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rich.console import Console
 
-from sb3_flock.evaluation import METRICS, EpisodeMetrics, summarize
-from sb3_flock.evaluation.metrics import score
-from sb3_flock.sim import Scenario, sense
-from tests.helpers import place
+from sb3_flock import FlockEvalCallback, make_vec_env
+from sb3_flock.controllers import make_controller
+from sb3_flock.evaluation import METRICS, EpisodeMetric, EpisodeMetrics, evaluate, register_metric, summarize
+from sb3_flock.evaluation.metrics import columns, is_higher_better, score
+from sb3_flock.evaluation.report import metrics_table, short_cells, short_summary, write_json
+from sb3_flock.rl.registry import build_model
+from sb3_flock.sim import Scenario, World, episode_rng
+from tests.helpers import SMALL_MODEL, place
 
 SCENARIO = Scenario(n_vehicles=3, n_obstacles=1, max_cycles=4)
 
@@ -14,12 +24,12 @@ def gather(steps, scenario=SCENARIO):
     metrics = EpisodeMetrics(scenario, 1)
     for positions, obstacles, waypoint, rewards in steps:
         world = place(scenario, positions, [0.0] * len(positions), obstacles, waypoint)
-        metrics.update(world, sense(world), np.array([rewards], dtype=float))
+        metrics.update(world, world.sense(), np.array([rewards], dtype=float))
     return {name: value[0] for name, value in metrics.result().items()}
 
 
 def test_every_metric_by_hand():
-    close = [(0.0, 0.0), (0.12, 0.0), (0.0, 0.05)]  # 0 and 2 are too close; 1 and 2 are 0.13 apart
+    close = [(0.0, 0.0), (0.12, 0.0), (0.0, 0.05)]  # 0 and 2 violate their separation; 1 and 2 are 0.13 apart
     apart = [(0.0, 0.0), (0.12, 0.0), (0.5, 0.0)]  # 2 is alone
     chain = [(0.0, 0.0), (0.12, 0.0), (0.24, 0.0)]  # connected, the ends not linked
     values = gather(
@@ -45,7 +55,86 @@ def test_every_metric_by_hand():
     assert values["return"] == pytest.approx(6 / 3 + 3 / 3 - 3 / 3)
 
 
-def test_success_needs_a_clean_flight_and_a_good_end():
+def reference(scenario, episode):
+    """Every built-in metric of one episode by loops over bodies, from (positions, obstacles, waypoint, rewards) a step."""
+    n, horizon = scenario.n_vehicles, scenario.max_cycles
+    errors, all_errors, pair_means, linked, connected = [], [], [], [], []
+    smallest_pair = smallest_obstacle = np.inf
+    neighbor_violations = obstacle_violations = 0
+    arrived = False
+    for k, (positions, obstacles, waypoint, _) in enumerate(episode, start=1):
+        distances = [float(np.hypot(*(position - waypoint))) for position in positions]
+        all_errors += distances
+        links = {i: set() for i in range(n)}
+        pairs = []
+        violating = set()
+        for i in range(n):
+            for j in range(i):
+                distance = float(np.hypot(*(positions[i] - positions[j])))
+                pairs.append(distance)
+                if distance < scenario.link_range:
+                    links[i].add(j)
+                    links[j].add(i)
+                if distance < scenario.neighbor_separation:
+                    violating |= {i, j}
+            clearances = [float(np.hypot(*(positions[i] - obstacle))) for obstacle in obstacles]
+            smallest_obstacle = min([smallest_obstacle, *clearances])
+            obstacle_violations += any(clearance < scenario.obstacle_separation for clearance in clearances)
+        smallest_pair = min([smallest_pair, *pairs])
+        neighbor_violations += len(violating)
+        reached, waiting = {0}, [0]
+        while waiting:
+            new = links[waiting.pop()] - reached
+            reached |= new
+            waiting += new
+        if 2 * k > horizon:
+            errors += distances
+            pair_means += pairs
+            linked += [distance for distance in pairs if distance < scenario.link_range]
+            connected.append(len(reached) == n)
+            arrived = connected[-1] and max(distances) < scenario.link_range
+    meets = smallest_obstacle < scenario.detection_range
+    nan = float("nan")
+    return {
+        "tracking_error": np.mean(errors),
+        "tracking_error_episode": np.mean(all_errors),
+        "min_separation_obstacles": smallest_obstacle if scenario.n_obstacles else nan,
+        "encounter_min_separation_obstacles": smallest_obstacle if scenario.n_obstacles and meets else nan,
+        "min_separation_neighbors": smallest_pair if n > 1 else nan,
+        "mean_separation": np.mean(pair_means) if n > 1 else nan,
+        "mean_separation_linked": np.mean(linked) if linked else nan,
+        "obstacle_violation_rate": obstacle_violations / (n * horizon) if scenario.n_obstacles else nan,
+        "neighbor_violation_rate": neighbor_violations / (n * horizon) if n > 1 else nan,
+        "connectivity": np.mean(connected),
+        "success_rate": float(arrived and not neighbor_violations and not obstacle_violations),
+        "return": sum(np.mean(rewards) for *_, rewards in episode),
+    }
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**31), st.integers(1, 5), st.integers(0, 3), st.integers(1, 9), st.floats(0.05, 0.6))
+def test_every_metric_against_loops_over_the_bodies(seed, n_vehicles, n_obstacles, max_cycles, spread):
+    scenario = Scenario(n_vehicles=n_vehicles, n_obstacles=n_obstacles, max_cycles=max_cycles)
+    rng, flocks = np.random.default_rng(seed), 3
+    world, metrics = World(scenario, flocks), EpisodeMetrics(scenario, flocks)
+    world.reset([episode_rng(seed, flock) for flock in range(flocks)])
+    episodes = [[] for _ in range(flocks)]
+    for _ in range(max_cycles):
+        world.positions = rng.uniform(-spread, spread, (flocks, n_vehicles, 2))
+        world.obstacle_positions = rng.uniform(-spread, spread, (flocks, n_obstacles, 2))
+        world.waypoints = rng.uniform(-spread, spread, (flocks, 2))
+        rewards = rng.normal(size=(flocks, n_vehicles))
+        metrics.update(world, world.sense(), rewards)
+        for flock, episode in enumerate(episodes):
+            bodies = world.positions[flock], world.obstacle_positions[flock], world.waypoints[flock]
+            episode.append((*bodies, rewards[flock]))
+    expected = [reference(scenario, episode) for episode in episodes]
+    assert set(expected[0]) == set(METRICS)
+    for name, values in metrics.result().items():
+        np.testing.assert_allclose(values, [row[name] for row in expected], rtol=1e-9, atol=1e-12, err_msg=name)
+
+
+def test_success_needs_no_violation_and_a_connected_end_at_the_waypoint():
     good = ([(0.0, 0.0), (0.12, 0.0), (0.06, 0.11)], [(1.0, 1.0)], (0.06, 0.04), (0, 0, 0))
     far = ([(0.5, 0.0), (0.62, 0.0), (0.56, 0.11)], [(1.0, 1.0)], (0.06, 0.04), (0, 0, 0))
     split = ([(0.14, 0.0), (-0.14, 0.0), (0.0, 0.14)], [(1.0, 1.0)], (0.0, 0.0), (0, 0, 0))  # all near, none linked
@@ -62,9 +151,9 @@ def test_thresholds_are_strict():
     assert values["connectivity"] == 0.0
 
 
-def test_the_settled_window_is_the_second_half():
+def test_the_steady_state_is_the_second_half():
     near, far = [(0.1, 0.0)], [(0.9, 0.0)]
-    one = Scenario(n_vehicles=1, n_obstacles=0, max_cycles=5)  # T/2 = 2.5: steps 3, 4 and 5 are settled
+    one = Scenario(n_vehicles=1, n_obstacles=0, max_cycles=5)  # T/2 = 2.5: steps 3, 4 and 5 are the steady state
     steps = [(position, [], (0.0, 0.0), (0,)) for position in (far, far, near, near, near)]
     assert gather(steps, one)["tracking_error"] == pytest.approx(0.1)
 
@@ -108,10 +197,104 @@ def test_the_interval_is_the_percentile_bootstrap():
     assert metric.high - metric.low == pytest.approx(2 * 1.96 * values.std() / np.sqrt(150), rel=0.05)
 
 
-def test_the_score_prefers_safe_and_connected():
+def test_the_score_adds_violations_and_lost_connectivity_to_the_tracking_error():
     base = {"tracking_error": 0.1, "neighbor_violation_rate": 0.0, "obstacle_violation_rate": 0.0, "connectivity": 1.0}
     assert score(base) == pytest.approx(0.1)
     assert score({**base, "neighbor_violation_rate": 0.01}) == pytest.approx(0.12)
     assert score({**base, "obstacle_violation_rate": 0.01}) == pytest.approx(0.14)
     assert score({**base, "connectivity": 0.9}) == pytest.approx(0.12)
     assert score({**base, "neighbor_violation_rate": float("nan")}) == pytest.approx(0.1)
+
+
+def test_every_metric_names_its_unit_direction_and_description():
+    for name, metric in METRICS.items():
+        assert metric.name == name
+        assert metric.unit in {"m", ""}
+        assert metric.better in {"lower", "higher"}
+        assert is_higher_better(name) == (metric.better == "higher")
+        assert metric.description
+        assert ("[m]" in metric.description) == (metric.unit == "m"), name
+    assert list(columns()) == ["tracking_error", "obstacle_violation_rate", "neighbor_violation_rate", "connectivity"]
+    assert not is_higher_better("score")
+
+
+# A metric registered outside the package
+
+
+class MeanSpeed(EpisodeMetric):
+    """Mean speed of the vehicles, of which the base class knows nothing."""
+
+    name, unit, better, column = "mean_speed", "m/s", "higher", "speed"
+    description = "mean speed over vehicles and steps [m/s]"
+
+    def __init__(self, scenario, n_flocks):
+        super().__init__(scenario, n_flocks)
+        self._distance, self._steps = np.zeros(n_flocks), 0
+
+    def update(self, step):
+        self._distance += step.sensing.ego_motion[..., 0].mean(-1)
+        self._steps += 1
+
+    def result(self):
+        return self._distance / (self._steps * self.scenario.time_step)
+
+
+@pytest.fixture
+def _mean_speed(restored):
+    restored(METRICS)
+    assert register_metric(MeanSpeed) is MeanSpeed
+    assert register_metric(MeanSpeed) is MeanSpeed  # the same class again is no error
+
+
+def shown(table, width):
+    console = Console(width=width, record=True, file=io.StringIO())
+    console.print(table)
+    return console.export_text()
+
+
+@pytest.mark.usefixtures("_mean_speed")
+def test_a_registered_metric_is_in_the_results_the_tables_and_the_json(tmp_path):
+    scenario = Scenario(max_cycles=10)
+    metrics = evaluate(make_controller("random"), scenario, episodes=20)
+    assert metrics["mean_speed"].n == 20
+    assert metrics["mean_speed"].mean == pytest.approx(0.075, abs=0.01)
+    assert metrics["mean_speed"].worst is None
+    rows = shown(metrics_table(metrics, scenario), 80).splitlines()
+    assert [row.split()[:2] for row in rows if row.strip().startswith("mean_speed")] == [
+        ["mean_speed", f"{metrics['mean_speed'].mean:.3f}"]
+    ]
+    means = {name: metric.mean for name, metric in metrics.items()}
+    assert short_cells(means)[-1] == f"{metrics['mean_speed'].mean:.3f}"
+    assert short_summary(means).endswith(f", speed {metrics['mean_speed'].mean:.3f}")
+    write_json(tmp_path / "out.json", metrics, {})
+    written = json.loads((tmp_path / "out.json").read_text())["metrics"]["mean_speed"]
+    assert written["mean"] == metrics["mean_speed"].mean
+    assert set(written) == {"mean", "low", "high", "n"}
+
+
+@pytest.mark.usefixtures("_mean_speed")
+def test_a_registered_metric_is_in_the_history_of_the_evaluations(tmp_path):
+    lines = []
+    callback = FlockEvalCallback(Scenario(max_cycles=5), 30, 3, tmp_path, report=lines.append)
+    model = build_model(SMALL_MODEL, make_vec_env(SMALL_MODEL.scenario, 1, seed=0))
+    model.learn(60, callback)
+    history = callback.state_dict()["history"]
+    assert len(history["mean_speed"]) == len(history["timesteps"]) == len(lines) >= 2
+    assert all(0.0 <= speed <= 0.15 for speed in history["mean_speed"])
+    assert all(", speed 0." in line for line in lines)
+    np.testing.assert_array_equal(np.load(tmp_path / "evaluations.npz")["mean_speed"], history["mean_speed"])
+
+
+@pytest.mark.usefixtures("_mean_speed")
+@pytest.mark.parametrize("name", ["mean_speed", "connectivity"])
+def test_a_metrics_name_is_taken_once(name):
+    with pytest.raises(ValueError, match=f"metric '{name}' is registered already"):
+        register_metric(type("Other", (MeanSpeed,), {"name": name}))
+
+
+def test_a_metric_without_a_column_is_in_no_short_table(restored):
+    restored(METRICS)
+    before = short_summary({})
+    register_metric(type("Hidden", (MeanSpeed,), {"name": "hidden", "column": None}))
+    assert short_summary({}) == before
+    assert "hidden" in evaluate(make_controller("random"), Scenario(max_cycles=3), episodes=2)

@@ -4,34 +4,36 @@ import numpy as np
 import pytest
 import torch as th
 
-from sb3_flock import FlockDDPG, evaluate, load_policy
+from sb3_flock import FlockDDPG, evaluate, load_policy, train
 from sb3_flock.config.training import TrainingConfig
 from sb3_flock.evaluation import model_cards
 from sb3_flock.evaluation.model_cards import median_of_seeds, read_card, ship
 from sb3_flock.pretrained import shipped_policies
 from sb3_flock.serialization.load import PolicyError, find_policy
-from tests.helpers import quiet, tiny, train
+from sb3_flock.serialization.migrate import FORMAT, migrate_config
+from tests.helpers import quiet, tiny
 
 SHIPPED = sorted(shipped_policies())
 
 
-def test_the_papers_setups_and_more_are_shipped():
+def test_policies_for_the_papers_setups_and_more_are_shipped():
     setups = ("3v1o", "5v1o", "5v2o")
     assert {
         "general",
         "crossing-5v2o",
-        *(f"{kind}-{setup}" for kind in ("paper", "second-look") for setup in setups),
+        *(f"{kind}-{setup}" for kind in ("ddpg", "ddpg-bc") for setup in setups),
     } <= set(SHIPPED)
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_a_shipped_policy_flies_as_its_card_says(name):
+def test_a_shipped_policy_behaves_as_its_card_says(name):
     policy, card = load_policy(name), read_card(name)
     assert policy.path.stat().st_size < 1_000_000
     check = card["check"]
     metrics = evaluate(policy, episodes=check["episodes"], seed=check["seed"])
     assert metrics["tracking_error"].mean == pytest.approx(check["tracking_error"], abs=0.003)
-    assert TrainingConfig(**card["config"]) == policy.config
+    config, _ = migrate_config(TrainingConfig, card["config"], FORMAT)
+    assert TrainingConfig(**config) == policy.config
     assert card["versions"] == policy.versions
     assert card["shipped_seed"] in [seed["seed"] for seed in card["seeds"]]
 
@@ -62,7 +64,7 @@ def test_a_card_keeps_every_training_and_the_zip_is_the_best_ones(tmp_path, monk
 
 def test_a_file_of_the_same_name_wins_over_a_shipped_policy(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert find_policy("ddpg-5v2o").parent.name == "policies"
+    assert find_policy("ddpg-5v2o").parent.name == "pretrained"
     (tmp_path / "ddpg-5v2o").write_bytes(b"mine")
     assert find_policy("ddpg-5v2o").read_bytes() == b"mine"
     with pytest.raises(PolicyError, match="nor one of .*ddpg-5v2o"):

@@ -17,7 +17,7 @@ def text(scenario, width=80):
     return console.export_text()
 
 
-def test_the_paper_stands_beside_ours_with_both_tables_for_3_1():
+def test_the_papers_figures_are_beside_ours_with_both_tables_for_3_vehicles_and_1_obstacle():
     both = text(Scenario(n_vehicles=3, n_obstacles=1))
     assert " paper I " in both
     assert "paper II" in both

@@ -1,18 +1,21 @@
 import numpy as np
 import pytest
-from gymnasium import spaces
 
 from sb3_flock import FlockPolicy, Scenario, evaluate
+from sb3_flock.controllers import Controller, make_controller
 from sb3_flock.controllers.policy import PolicyController
 from sb3_flock.envs.flocking_v0 import action_space, observation_space
-from sb3_flock.evaluation import METRICS, fly
+from sb3_flock.evaluation import METRICS, rollout
+from sb3_flock.evaluation.rollout import as_controller, iter_rollout, rollout_batch
+from sb3_flock.serialization.load import PolicyError, load_policy
 from sb3_flock.settings import SettingsError
+from sb3_flock.sim import episode_rng
 
 SCENARIO = Scenario(n_vehicles=5, n_obstacles=2, max_cycles=40, arena=0.5, obstacle_arena=0.5)
 
 
-class GoToWaypoint:
-    """Turns to the waypoint and flies to it, heeding nothing else."""
+class GoToWaypoint(Controller):
+    """Turns to the waypoint and drives to it, whatever else is sensed."""
 
     def act(self, sensing, scenario):
         x, y = sensing.waypoint_positions[..., 0], sensing.waypoint_positions[..., 1]
@@ -21,28 +24,28 @@ class GoToWaypoint:
 
 @pytest.fixture(scope="module")
 def network():
-    """Networks with large random weights, so that actions vary with the tensors."""
+    """Networks with large random weights, so that actions vary with the observations."""
     return FlockPolicy(observation_space(SCENARIO), action_space(SCENARIO), lr_schedule=lambda _: 0.0, final_init=1.0)
 
 
 def test_the_numbers_do_not_depend_on_the_batch(network):
-    flown = [fly(PolicyController(network), SCENARIO, 23, seed=4, batch=batch) for batch in (23, 10, 1)]
+    results = [rollout(PolicyController(network), SCENARIO, 23, seed=4, batch=batch) for batch in (23, 10, 1)]
     for name in METRICS:
-        np.testing.assert_array_equal(flown[0][name], flown[1][name])
-        np.testing.assert_array_equal(flown[0][name], flown[2][name])
+        np.testing.assert_array_equal(results[0][name], results[1][name])
+        np.testing.assert_array_equal(results[0][name], results[2][name])
 
 
 def test_fewer_episodes_are_the_first_of_more(network):
-    many, few = (fly(PolicyController(network), SCENARIO, episodes, seed=4) for episodes in (20, 5))
+    many, few = (rollout(PolicyController(network), SCENARIO, episodes, seed=4) for episodes in (20, 5))
     np.testing.assert_array_equal(many["return"][:5], few["return"])
 
 
 def test_seeds_change_the_episodes():
-    first, second = (fly(GoToWaypoint(), SCENARIO, 5, seed=seed)["return"] for seed in (0, 1))
+    first, second = (rollout(GoToWaypoint(), SCENARIO, 5, seed=seed)["return"] for seed in (0, 1))
     assert not np.array_equal(first, second)
 
 
-def test_a_controller_that_heads_for_the_waypoint_tracks_it_and_collides():
+def test_a_controller_that_drives_to_the_waypoint_tracks_it_and_violates_separations():
     metrics = evaluate(GoToWaypoint(), SCENARIO.replace(max_cycles=200), episodes=20, seed=0)
     assert metrics["tracking_error"].mean < 0.05
     assert metrics["neighbor_violation_rate"].mean > 0.3
@@ -56,19 +59,85 @@ def test_a_policy_needs_a_scenario_from_somewhere(network):
 
 
 @pytest.mark.parametrize(("kwargs", "name"), [({"episodes": 0}, "episodes = 0"), ({"seed": -1}, "seed = -1")])
-def test_bad_counts_are_told_in_one_line(kwargs, name):
+def test_bad_counts_are_refused_in_one_line(kwargs, name):
     with pytest.raises(SettingsError, match=name):
         evaluate(GoToWaypoint(), SCENARIO, **{"episodes": 1, **kwargs})
 
 
-def test_a_policy_controller_gives_each_vehicle_its_own_action(network):
-    from sb3_flock.sim import World, episode_rng, observe
+def test_a_controller_or_a_policy_becomes_a_controller(network):
+    controller = GoToWaypoint()
+    assert as_controller(controller, SCENARIO) is controller
+    adapted = as_controller(network, SCENARIO)
+    assert isinstance(adapted, PolicyController)
+    assert adapted.policy is network
 
-    world = World(SCENARIO, 3)
-    sensing = world.reset([episode_rng(0, e) for e in range(3)])
-    actions = PolicyController(network).act(sensing, SCENARIO)
-    assert actions.shape == (3, 5, 2)
-    alone, _ = network.predict(observe(sensing, SCENARIO)[2, 4], deterministic=True)
-    np.testing.assert_allclose(actions[2, 4], alone, rtol=1e-4, atol=1e-6)
-    assert isinstance(action_space(SCENARIO), spaces.Box)
-    assert all(action_space(SCENARIO).contains(action.astype(np.float32)) for action in actions.reshape(-1, 2))
+
+class ActsAlone:
+    """Has the method of a controller, without being one."""
+
+    def act(self, sensing, scenario):
+        raise AssertionError
+
+
+class PredictsNothing:
+    predict = None
+
+
+@pytest.mark.parametrize("policy", [object(), ActsAlone(), PredictsNothing(), None, "ddpg-3v1o"])
+def test_an_object_without_predict_is_refused_in_one_line(policy):
+    needed = f"policy = {type(policy).__name__}: a Controller, or an object with SB3's predict, is needed"
+    with pytest.raises(SettingsError) as error:
+        as_controller(policy, SCENARIO)
+    assert str(error.value) == needed
+    with pytest.raises(SettingsError, match="is needed"):
+        evaluate(policy, SCENARIO, episodes=1)
+
+
+def test_a_loaded_policy_is_checked_against_the_scenario():
+    policy = load_policy("ddpg-3v1o")
+    assert isinstance(as_controller(policy, policy.scenario), PolicyController)
+    with pytest.raises(PolicyError, match="its observations have the shape"):
+        as_controller(policy, policy.scenario.replace(n_anchors=9))
+    with pytest.warns(UserWarning, match="link_range = 0.15, evaluated with 0.2"):
+        as_controller(policy, policy.scenario.replace(link_range=0.2))
+
+
+def test_one_episode_is_the_batchs_episode_of_that_number():
+    worlds = [
+        (world.steps, world.positions[0].copy(), world.waypoints[0].copy())
+        for world in iter_rollout(GoToWaypoint(), SCENARIO, seed=4, episode=2)
+    ]
+    assert [steps for steps, *_ in worlds] == list(range(41))
+    errors = [np.linalg.norm(positions - waypoint, axis=-1).mean() for steps, positions, waypoint in worlds if steps > 20]
+    assert np.mean(errors) == pytest.approx(rollout(GoToWaypoint(), SCENARIO, 3, seed=4)["tracking_error"][2])
+    for name in ("seed", "episode"):
+        with pytest.raises(SettingsError, match=f"{name} = -1"):
+            next(iter_rollout(GoToWaypoint(), SCENARIO, **{name: -1}))
+
+
+def test_a_batch_takes_its_controller_from_the_world():
+    made = []
+
+    def make(world):
+        made.append(world)
+        return make_controller("go-to-waypoint")
+
+    values = rollout_batch(make, SCENARIO, [episode_rng(0, episode) for episode in range(3)])
+    assert [(world.n_flocks, world.scenario, world.steps) for world in made] == [(3, SCENARIO, 40)]
+    np.testing.assert_array_equal(values["return"], rollout(make_controller("go-to-waypoint"), SCENARIO, 3, 0)["return"])
+
+
+class Recorder(GoToWaypoint):
+    """Keeps what the base class is called with."""
+
+    def __init__(self):
+        self.resets = []
+
+    def reset(self, rngs, scenario):
+        self.resets.append((len(rngs), scenario))
+
+
+def test_a_controller_is_reset_before_each_batch():
+    controller = Recorder()
+    rollout(controller, SCENARIO, 5, seed=0, batch=2)
+    assert controller.resets == [(2, SCENARIO), (2, SCENARIO), (1, SCENARIO)]

@@ -1,4 +1,4 @@
-"""The second look: what was sensed a while ago, seen from the place of now."""
+"""Motion channels: the difference to what was sensed ``motion_lag`` ago, in the present body frame."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from tests.helpers import assert_copy_continues_alike
 CROWD = Scenario(n_vehicles=8, n_obstacles=4, arena=0.3, obstacle_arena=0.4, motion_lag=0.3)
 
 
-def flown(scenario, steps, n_flocks=2, standing=()):
+def simulated(scenario, steps, n_flocks=2, standing=()):
     """What is measured at the start and after each step of random actions, and the world's states then."""
     world = World(scenario, n_flocks)
     rng = np.random.default_rng(0)
@@ -28,18 +28,18 @@ def flown(scenario, steps, n_flocks=2, standing=()):
     return measured, states
 
 
-def test_earlier_contacts_are_where_they_were_in_the_frame_of_now():
-    measured, states = flown(CROWD, 8)
+def test_previous_contacts_are_at_their_previous_positions_in_the_present_frame():
+    measured, states = simulated(CROWD, 8)
     assert all(sum(len(getattr(now.previous, kind).bodies) for now in measured) for kind in ("neighbors", "obstacles"))
     for step, now in enumerate(measured):
         then, here = states[max(0, step - 3)], states[step]
         headings = here["headings"]
         frames = np.stack((np.cos(headings), np.sin(headings)), axis=-1)
-        for contacts, bodies, reach, others in (
+        for contacts, bodies, sensing_range, exclude_self in (
             (now.previous.neighbors, then["positions"], 0.15, True),
             (now.previous.obstacles, then["obstacle_positions"], 0.25, False),
         ):
-            in_range_then = find_contacts(then["positions"], frames, bodies, reach, others)
+            in_range_then = find_contacts(then["positions"], frames, bodies, sensing_range, exclude_self)
             seen_from_here = find_contacts(here["positions"], frames, bodies, np.inf)
             pairs = {
                 (observer, body): position
@@ -60,41 +60,41 @@ def test_earlier_contacts_are_where_they_were_in_the_frame_of_now():
         np.testing.assert_allclose(now.previous.waypoint_distances, np.linalg.norm(offsets, axis=-1), atol=1e-12)
 
 
-def test_what_stands_still_shows_no_change_whoever_moves():
+def test_a_body_at_rest_is_0_in_the_motion_channels_whoever_moves():
     still = CROWD.replace(n_vehicles=4, obstacle_max_speed=0.0, waypoint_speed=0.0, goal_radius=10.0, link_range=9.0)
     still = still.replace(detection_range=9.0, neighbor_radius=0.5, obstacle_radius=0.5)
-    measured, _ = flown(still, 5, standing=(1, 2, 3))
-    tensor = observe(measured[-1], still)
-    np.testing.assert_allclose(tensor[:, 0, 3:], 0.0, atol=1e-6)  # all others stand, and so does what the flier sees
-    assert np.abs(tensor[:, 1:, 3]).max() > 0.05  # the flier in the eyes of the others
+    measured, _ = simulated(still, 5, standing=(1, 2, 3))
+    observations = observe(measured[-1], still)
+    np.testing.assert_allclose(observations[:, 0, 3:], 0.0, atol=1e-6)  # vehicle 0 moves and observes bodies at rest
+    assert np.abs(observations[:, 1:, 3]).max() > 0.05  # the others are at rest and observe vehicle 0
 
 
-def test_the_change_is_the_difference_of_two_looks_and_the_first_channels_stay():
-    measured, _ = flown(CROWD, 6)
-    plain, _ = flown(CROWD.replace(motion_lag=0.0), 6)
+def test_motion_channels_are_the_difference_of_two_observations_and_the_first_channels_stay():
+    measured, _ = simulated(CROWD, 6)
+    plain, _ = simulated(CROWD.replace(motion_lag=0.0), 6)
     for now, alone in zip(measured, plain, strict=True):
-        tensor = observe(now, CROWD)
-        assert tensor.shape[2:] == CROWD.observation_shape == (6, 11, 11)
+        observations = observe(now, CROWD)
+        assert observations.shape[2:] == CROWD.observation_shape == (6, 11, 11)
         present = observe(alone, CROWD.replace(motion_lag=0.0))
-        np.testing.assert_array_equal(tensor[:, :, :3], present)
+        np.testing.assert_array_equal(observations[:, :, :3], present)
         previous = observe(now.previous, CROWD.replace(motion_lag=0.0))
-        np.testing.assert_allclose(tensor[:, :, 3:], present - earlier, atol=1e-6)
-        np.testing.assert_allclose(observe(now, CROWD, use_numba=False), tensor, atol=1e-5)
+        np.testing.assert_allclose(observations[:, :, 3:], present - previous, atol=1e-6)
+        np.testing.assert_allclose(observe(now, CROWD, use_numba=False), observations, atol=1e-5)
     np.testing.assert_array_equal(observe(measured[0], CROWD)[:, :, 3:], 0.0)
 
 
 @pytest.mark.parametrize(("motion_lag", "time_step", "steps"), [(0.0, 0.1, 0), (0.2, 0.1, 2), (0.3, 0.1, 3), (0.2, 0.2, 1)])
-def test_it_is_of_a_whole_number_of_steps(motion_lag, time_step, steps):
+def test_the_motion_lag_is_a_whole_number_of_steps(motion_lag, time_step, steps):
     assert Scenario(motion_lag=motion_lag, time_step=time_step).motion_lag_steps == steps
 
 
-def test_a_delay_is_one_of_both_looks():
-    late, on_time = (flown(CROWD.replace(sensors=SensorErrors(delay=delay)), 6)[0] for delay in (0.2, 0.0))
+def test_a_delay_applies_to_the_present_and_the_previous_measurement():
+    late, on_time = (simulated(CROWD.replace(sensors=SensorErrors(delay=delay)), 6)[0] for delay in (0.2, 0.0))
     for step, measured in enumerate(late):
         np.testing.assert_array_equal(observe(measured, CROWD), observe(on_time[max(0, step - 2)], CROWD))
 
 
-def test_an_env_goes_on_from_its_state():
+def test_an_env_continues_from_its_state():
     env = flocking_v0.parallel_env(CROWD.replace(sensors=SensorErrors(position_noise=0.01, dropout=0.2, delay=0.1)))
     env.reset(seed=2)
     actions = dict.fromkeys(env.agents, np.array([0.1, 0.5], dtype=np.float32))
@@ -111,6 +111,6 @@ def test_mistakes_are_one_line():
             Scenario(motion_lag=motion_lag)
     for motion_lag in (0.1, 0.3):
         with pytest.raises(
-            SettingsError, match=f"motion_lag = {motion_lag}: .* multiple of 0.2 s, the sampling period of practice"
+            SettingsError, match=f"motion_lag = {motion_lag}: .* multiple of 0.2 s, the training env's sampling period"
         ):
             TrainingConfig(scenario=Scenario(motion_lag=motion_lag))

@@ -3,8 +3,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sb3_flock.sim import Scenario, World, episode_rng, sense, sensing
+from sb3_flock.sim import Scenario, World, episode_rng, sensing
 from sb3_flock.sim.sensing import Contacts, distance_blocks, find_contacts, is_connected, nearest
+from tests.helpers import place
 
 
 def graph(links, n, flocks=1):
@@ -16,10 +17,10 @@ def graph(links, n, flocks=1):
     return Contacts((flocks, n), observers, bodies, np.zeros((len(bodies), 2)), np.zeros(len(bodies)))
 
 
-def test_the_body_frame_has_forward_on_x_and_left_on_y(scenario, place):
+def test_the_body_frame_has_forward_on_x_and_left_on_y(scenario):
     # Vehicle 0 looks north: the vehicle east of it is on its right, the obstacle north of it ahead.
     world = place(scenario, [(0.0, 0.0), (0.1, 0.0)], [np.pi / 2, 0.0], obstacles=[(0.0, 0.2)], waypoint=(-0.3, 0.0))
-    seen = sense(world)
+    seen = world.sense()
     np.testing.assert_array_equal(seen.neighbors.observers, [0, 1])
     np.testing.assert_allclose(seen.neighbors.positions, [(0.0, -0.1), (-0.1, 0.0)], atol=1e-15)
     np.testing.assert_allclose(seen.obstacles.positions[0], (0.2, 0.0), atol=1e-15)
@@ -27,10 +28,10 @@ def test_the_body_frame_has_forward_on_x_and_left_on_y(scenario, place):
     np.testing.assert_allclose(seen.waypoint_distances[0], (0.3, 0.4))
 
 
-def test_graphs_take_strictly_closer_bodies_and_never_the_vehicle_itself(scenario, place):
+def test_graphs_take_strictly_closer_bodies_and_never_the_vehicle_itself(scenario):
     wide = scenario.replace(link_range=0.25, detection_range=0.5, neighbor_separation=0.1)
     world = place(wide, [(0.0, 0.0), (0.25, 0.0), (0.0, 0.125)], [0.0] * 3, obstacles=[(0.0, -0.5), (0.0, -0.25)])
-    seen = sense(world)
+    seen = world.sense()
     assert [bodies.tolist() for bodies in seen.neighbors.by_observer()] == [[2], [], [0]]
     assert seen.obstacles.by_observer()[0].tolist() == [1]
     np.testing.assert_array_equal(seen.neighbors.count(), [[1, 0, 1]])
@@ -38,8 +39,8 @@ def test_graphs_take_strictly_closer_bodies_and_never_the_vehicle_itself(scenari
     np.testing.assert_allclose(seen.neighbors.sum(seen.neighbors.distances), [[0.125, 0.0, 0.125]])
 
 
-def test_one_vehicle_and_no_obstacle_leave_empty_graphs(scenario, place):
-    seen = sense(place(scenario, [(0.0, 0.0)], [0.0]))
+def test_one_vehicle_and_no_obstacle_leave_empty_graphs(scenario):
+    seen = place(scenario, [(0.0, 0.0)], [0.0]).sense()
     assert seen.neighbors.count().tolist() == seen.obstacles.count().tolist() == [[0]]
     assert seen.neighbors.by_observer()[0].size == 0
     assert seen.waypoint_distances[0, 0] == 0.0
@@ -47,23 +48,24 @@ def test_one_vehicle_and_no_obstacle_leave_empty_graphs(scenario, place):
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**31), st.integers(1, 3), st.integers(1, 40), st.integers(0, 20), st.floats(0.01, 0.8))
-def test_compiled_plain_and_by_cells_are_the_same_to_the_last_bit(seed, flocks, vehicles, obstacles, reach):
+def test_numba_all_pairs_and_the_cell_list_are_equal_to_the_last_bit(seed, flocks, vehicles, obstacles, sensing_range):
     pytest.importorskip("numba")
     rng = np.random.default_rng(seed)
     positions, bodies = (rng.uniform(-1, 1, (flocks, count, 2)) for count in (vehicles, obstacles))
     positions[rng.random((flocks, vehicles)) < 0.05] += 1e3  # far away
     angles = rng.uniform(-np.pi, np.pi, (flocks, vehicles))
     frames = np.stack((np.cos(angles), np.sin(angles)), axis=-1)
-    for others, seen in ((True, positions), (False, bodies)):
-        compiled, plain = (find_contacts(positions, frames, seen, reach, others, use) for use in (True, False))
+    for exclude_self, sensed in ((True, positions), (False, bodies)):
+        arguments = positions, frames, sensed, sensing_range, exclude_self
+        fast, plain = (find_contacts(*arguments, use_numba=use_numba) for use_numba in (True, False))
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(sensing, "_FEW", -1)
-            by_cells = find_contacts(positions, frames, seen, reach, others)
+            by_cells = find_contacts(*arguments)
         for other in (plain, by_cells):
             for name in ("observers", "bodies", "positions", "distances"):
-                np.testing.assert_array_equal(getattr(compiled, name), getattr(other, name))
-        distances = np.concatenate([block for _, block in distance_blocks(positions, seen, others)], axis=1)
-        np.testing.assert_array_equal(compiled.count(), (distances < reach).sum(-1))
+                np.testing.assert_array_equal(getattr(fast, name), getattr(other, name))
+        distances = np.concatenate([block for _, block in distance_blocks(positions, sensed, exclude_self)], axis=1)
+        np.testing.assert_array_equal(fast.count(), (distances < sensing_range).sum(-1))
 
 
 def test_ten_thousand_vehicles_sense_in_linear_memory(scenario):

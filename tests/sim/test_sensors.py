@@ -2,11 +2,11 @@ import numpy as np
 import pytest
 
 from sb3_flock import flocking_v0
-from sb3_flock.controllers import make_controller
+from sb3_flock.controllers import Controller, make_controller
 from sb3_flock.evaluation import evaluate
-from sb3_flock.evaluation.rollout import fly
+from sb3_flock.evaluation.rollout import rollout
 from sb3_flock.settings import SettingsError
-from sb3_flock.sim import Scenario, World, episode_rng, sense
+from sb3_flock.sim import Scenario, World, episode_rng
 from sb3_flock.sim.sensors import SensorErrors
 from tests.helpers import assert_copy_continues_alike
 
@@ -18,20 +18,20 @@ def begin(scenario, n_flocks=1, first=0):
     return world, world.reset([episode_rng(0, episode) for episode in range(first, first + n_flocks)])
 
 
-def erring(**errors):
+def with_errors(**errors):
     return CROWD.replace(sensors=SensorErrors(**errors))
 
 
 def test_exact_sensors_measure_the_truth_and_draw_nothing():
     world, truth = begin(CROWD)
     assert world.sensors.measure(truth) is truth
-    other, _ = begin(erring(position_noise=0.01))
+    other, _ = begin(with_errors(position_noise=0.01))
     np.testing.assert_array_equal(world.positions, other.positions)  # errors change no start
     np.testing.assert_array_equal(world.obstacle_speeds, other.obstacle_speeds)
 
 
-def test_noise_is_as_large_as_asked_on_everything_measured():
-    world, truth = begin(erring(position_noise=0.02), n_flocks=200)
+def test_everything_measured_has_noise_of_the_set_standard_deviation():
+    world, truth = begin(with_errors(position_noise=0.02), n_flocks=200)
     measured = world.sensors.measure(truth)
     for contacts, exact in ((measured.neighbors, truth.neighbors), (measured.obstacles, truth.obstacles)):
         np.testing.assert_array_equal(contacts.bodies, exact.bodies)
@@ -44,8 +44,8 @@ def test_noise_is_as_large_as_asked_on_everything_measured():
     np.testing.assert_allclose(measured.waypoint_distances, np.linalg.norm(measured.waypoint_positions, axis=-1))
 
 
-def test_as_many_detections_are_missed_as_asked_but_never_the_waypoint():
-    world, truth = begin(erring(dropout=0.3), n_flocks=200)
+def test_the_set_share_of_detections_is_missed_but_never_the_waypoint():
+    world, truth = begin(with_errors(dropout=0.3), n_flocks=200)
     measured = world.sensors.measure(truth)
     for contacts, exact in ((measured.neighbors, truth.neighbors), (measured.obstacles, truth.obstacles)):
         assert len(contacts.bodies) / len(exact.bodies) == pytest.approx(0.7, abs=0.03)
@@ -53,12 +53,12 @@ def test_as_many_detections_are_missed_as_asked_but_never_the_waypoint():
         assert set(zip(contacts.observers.tolist(), contacts.bodies.tolist(), strict=True)) < pairs
         assert (np.diff(contacts.observers) >= 0).all()
     np.testing.assert_array_equal(measured.waypoint_positions, truth.waypoint_positions)
-    world, truth = begin(erring(dropout=1.0))
+    world, truth = begin(with_errors(dropout=1.0))
     assert not len(world.sensors.measure(truth).neighbors.bodies)
 
 
-def test_measurements_are_used_after_the_delay():
-    world, truth = begin(erring(delay=0.3))
+def test_a_measurement_is_used_after_the_delay():
+    world, truth = begin(with_errors(delay=0.3))
     seen = [truth]
     for step in range(8):
         measured = world.sensors.measure(seen[-1])
@@ -66,24 +66,26 @@ def test_measurements_are_used_after_the_delay():
         seen.append(world.step(np.full((1, 12, 2), 0.1))[0])
 
 
-def test_a_flock_errs_alike_whoever_flies_beside_it():
-    scenario = erring(position_noise=0.01, dropout=0.2, delay=0.1)
-    many, few = (fly(make_controller("go-to-waypoint"), scenario.replace(max_cycles=20), 6, 0, batch) for batch in (6, 2))
+def test_a_flocks_sensor_errors_do_not_depend_on_the_batch():
+    scenario = with_errors(position_noise=0.01, dropout=0.2, delay=0.1)
+    many, few = (
+        rollout(make_controller("go-to-waypoint"), scenario.replace(max_cycles=20), 6, 0, batch) for batch in (6, 2)
+    )
     for name in many:
         np.testing.assert_array_equal(many[name], few[name])
 
 
 def test_reward_and_metrics_are_of_the_truth():
-    class Still:
+    class Still(Controller):
         def act(self, sensing, scenario):
             return np.zeros((*sensing.waypoint_distances.shape, 2))
 
     exact = evaluate(Still(), CROWD, episodes=3)
-    assert evaluate(Still(), erring(position_noise=0.5, dropout=0.5, delay=1.0), episodes=3) == exact
+    assert evaluate(Still(), with_errors(position_noise=0.5, dropout=0.5, delay=1.0), episodes=3) == exact
 
 
-def test_an_env_shows_what_is_measured_and_goes_on_from_its_state():
-    env = flocking_v0.parallel_env(erring(position_noise=0.02, dropout=0.2, delay=0.2))
+def test_an_env_shows_what_is_measured_and_continues_from_its_state():
+    env = flocking_v0.parallel_env(with_errors(position_noise=0.02, dropout=0.2, delay=0.2))
     exact = flocking_v0.parallel_env(CROWD)
     observations, _ = env.reset(seed=3)
     truth, _ = exact.reset(seed=3)
@@ -97,8 +99,8 @@ def test_an_env_shows_what_is_measured_and_goes_on_from_its_state():
 
 
 def test_sense_is_always_exact():
-    world, truth = begin(erring(position_noise=0.5))
-    np.testing.assert_array_equal(sense(world).waypoint_positions, truth.waypoint_positions)
+    world, truth = begin(with_errors(position_noise=0.5))
+    np.testing.assert_array_equal(world.sense().waypoint_positions, truth.waypoint_positions)
 
 
 @pytest.mark.parametrize(("name", "value"), [("position_noise", -1.0), ("dropout", 1.1), ("delay", float("nan"))])

@@ -1,4 +1,4 @@
-"""Numbers stay sane over random scenarios and actions; ``pytest -m slow`` takes ten million vehicle-steps."""
+"""Numbers stay within their bounds over random scenarios and actions; ``pytest -m slow`` takes ten million vehicle-steps."""
 
 import gc
 import sys
@@ -52,10 +52,10 @@ def random_scenario(rng):
 
 
 def soak(vehicle_steps, seed):
-    """Fly random actions, some far out of bounds, and check every number."""
+    """Simulate random actions, some far out of bounds, and check every number."""
     rng = np.random.default_rng(seed)
-    flown = 0
-    while flown < vehicle_steps:
+    simulated = 0
+    while simulated < vehicle_steps:
         scenario = random_scenario(rng)
         n, m, weights = scenario.n_vehicles, scenario.n_obstacles, scenario.reward
         n_flocks = max(1, 6000 // n)
@@ -69,16 +69,16 @@ def soak(vehicle_steps, seed):
             actions = rng.normal(size=(n_flocks, n, 2)) * (3 * scenario.max_speed, 3 * scenario.max_turn_rate)
             before = world.positions
             sensing, clipped = world.step(actions)
-            moved = np.linalg.norm(world.positions - before, axis=-1)
-            reach = scenario.max_speed * scenario.time_step
-            assert (moved <= reach + 1e-12 * (reach + np.abs(world.positions).max())).all()
+            distances = np.linalg.norm(world.positions - before, axis=-1)
+            longest = scenario.max_speed * scenario.time_step
+            assert (distances <= longest + 1e-12 * (longest + np.abs(world.positions).max())).all()
             assert (np.abs(world.headings) <= np.pi).all()
             assert (np.abs(world.obstacle_positions) <= scenario.obstacle_half_side * (1 + 1e-12)).all() or m == 0
-            tensors = observe(world.sensors.measure(sensing), scenario)
-            assert tensors.dtype == np.float32
-            assert tensors.min() >= space.low.min()  # a NaN fails here, too
-            assert tensors.max() <= n + m + 1
-            terms = reward_terms(sensing, clipped, scenario)
+            observations = observe(world.sensors.measure(sensing), scenario)
+            assert observations.dtype == np.float32
+            assert observations.min() >= space.low.min()  # a NaN fails here, too
+            assert observations.max() <= n + m + 1
+            terms = reward_terms(sensing, clipped, scenario.reward, scenario)
             farthest = np.sqrt(8) * (np.abs(world.positions).max() + scenario.arena + np.abs(world.waypoints).max())
             farthest = min(farthest, weights.max_distance or np.inf)
             effort = scenario.max_speed**2 + scenario.max_turn_rate**2
@@ -98,8 +98,8 @@ def soak(vehicle_steps, seed):
             mixed = mix_rewards(own, observers, observers - observers % n + bodies, weights.lambda_)
             assert mixed.min() >= own.min() - 1e-9 * np.abs(own).max()
             assert mixed.max() <= own.max() + 1e-9 * np.abs(own).max()
-            flown += n_flocks * n
-    return flown
+            simulated += n_flocks * n
+    return simulated
 
 
 def memory():

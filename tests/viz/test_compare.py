@@ -8,7 +8,7 @@ from sb3_flock.cli import main
 from sb3_flock.config.training import TrainingConfig
 from sb3_flock.serialization.yaml_io import load_config, to_yaml
 from sb3_flock.settings import SettingsError
-from sb3_flock.viz.compare import curves_figure, differences_table, load_runs, results_table
+from sb3_flock.viz.compare import differences_table, load_runs, plot_curves, results_table
 
 
 def run_folder(folder, scores=(0.5, 0.2, 0.3), **changes):
@@ -38,8 +38,8 @@ def text(table, width=80):
 
 def test_each_run_is_shown_at_its_best(runs):
     shown = text(results_table(load_runs(runs))).splitlines()
-    assert shown[3].split() == ["a/one", "20k", "300k", "4", "0.011", "2.10%", "3.10%", "4.1%"]
-    assert shown[4].split() == ["b", "10k", "300k", "3", "0.010", "2.00%", "3.00%", "4.0%"]
+    assert shown[3].split() == ["a/one", "20k", "300k", "4", "0.011", "3.10%", "2.10%", "4.10%"]
+    assert shown[4].split() == ["b", "10k", "300k", "3", "0.010", "3.00%", "2.00%", "4.00%"]
     assert max(map(len, shown)) <= 80
 
 
@@ -50,7 +50,7 @@ def test_only_what_differs_in_the_configs_is_shown(runs):
 
 
 def test_the_curves_are_drawn(runs):
-    figure = curves_figure(load_runs(runs))
+    figure = plot_curves(load_runs(runs))
     assert [[len(line.get_xdata()) for line in axes.lines] for axes in figure.axes] == [[3, 2]] * 4
     np.testing.assert_allclose(figure.axes[0].lines[1].get_ydata(), [0.01, 0.011])
 
@@ -76,7 +76,10 @@ def test_mistakes_are_one_line(runs, tmp_path, capsys):
     with pytest.raises(SettingsError, match="no evaluation yet"):
         load_runs(runs)
     assert main(["compare", str(runs[1]), "--out", "curves.pdf"]) == 2
-    assert capsys.readouterr().err == "sb3-flock: --out curves.pdf: a name that ends in .png, .svg is needed\n"
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1
+    assert message.startswith("sb3-flock: ")
+    assert message.endswith("curves.pdf: a name that ends in .png, .svg is needed\n")
 
 
 def test_hostile_evaluations_are_not_run(runs):

@@ -95,9 +95,9 @@ def test_pause_step_and_new_episode(game):
     assert game.is_over
 
 
-def test_what_each_vehicle_sees_is_shown_in_turn(game):
+def test_the_observation_of_each_vehicle_is_shown_in_turn(game):
     def panel():
-        return pygame.surfarray.array3d(game.paint())[SIDE:]
+        return pygame.surfarray.array3d(game.draw())[SIDE:]
 
     plain = panel()
     for vehicle in range(3):
@@ -108,7 +108,7 @@ def test_what_each_vehicle_sees_is_shown_in_turn(game):
     np.testing.assert_array_equal(panel(), plain)
 
 
-def test_a_flight_has_no_end(game):
+def test_an_episode_has_no_end(game):
     game.world.steps = game.world.scenario.max_cycles
     obstacle = game.world.obstacle_positions.copy()
     game.step()
@@ -116,27 +116,27 @@ def test_a_flight_has_no_end(game):
     assert np.linalg.norm(game.world.obstacle_positions - obstacle) < 0.02
 
 
-def test_policies_and_laws_that_remember_fly_while_the_flock_changes():
+def test_policies_and_controllers_with_memory_continue_while_the_flock_changes():
     late = SensorErrors(position_noise=0.01, delay=0.2)
-    for flyer, changes in (
+    for policy, changes in (
         (load_policy("ddpg-5v2o"), {}),
         (load_policy("ddpg-5v2o"), {"sensors": late}),
         (load_policy("general"), {"motion_lag": 0.2}),
         (make_controller("orca"), {}),
     ):
-        game = Game(flyer, Scenario(n_vehicles=2, n_obstacles=1, **changes))
+        game = Game(policy, Scenario(n_vehicles=2, n_obstacles=1, **changes))
         for key in (pygame.K_PLUS, pygame.K_PLUS, pygame.K_v, pygame.K_MINUS):
             press(game, key)
             game.step()
-            game.paint()
+            game.draw()
         assert game.world.scenario.n_vehicles == 3
 
 
-def test_the_loop_flies_in_real_time_and_ends(monkeypatch):
+def test_the_loop_runs_in_real_time_and_ends(monkeypatch):
     seen = []
-    monkeypatch.setattr(Game, "paint", lambda self: seen.append(self) or pygame.Surface((SIDE, HEADER)))
+    monkeypatch.setattr(Game, "draw", lambda self: seen.append(self) or pygame.Surface((SIDE, HEADER)))
     monkeypatch.setattr(
-        "sb3_flock.play.pygame.event.get", lambda: [pygame.event.Event(pygame.QUIT)] if len(seen) > 20 else []
+        "sb3_flock.viz.play.pygame.event.get", lambda: [pygame.event.Event(pygame.QUIT)] if len(seen) > 20 else []
     )
     start = time.monotonic()
     play(make_controller("go-to-waypoint"), Scenario(), speed=4.0)
@@ -145,7 +145,7 @@ def test_the_loop_flies_in_real_time_and_ends(monkeypatch):
 
 
 def test_mistakes_are_one_line(monkeypatch, capsys):
-    with pytest.raises(SettingsError, match="--speed 0"):
+    with pytest.raises(SettingsError, match="speed = 0"):
         play(make_controller("random"), Scenario(), speed=0.0)
     monkeypatch.setenv("SDL_VIDEODRIVER", "x11")
     monkeypatch.setenv("DISPLAY", ":12345")
@@ -160,7 +160,7 @@ def test_mistakes_are_one_line(monkeypatch, capsys):
 
 @pytest.fixture
 def screen(monkeypatch):
-    """An X server of its own, which does not start anew (and drop who is just connecting) as its last client leaves."""
+    """An X server of its own. Without -noreset it would restart, and drop new clients, when its last client leaves."""
     read, write = os.pipe()
     server = subprocess.Popen(
         ["Xvfb", "-noreset", "-displayfd", str(write), "-screen", "0", "1000x800x24", "-nolisten", "tcp"],
@@ -176,8 +176,23 @@ def screen(monkeypatch):
     server.wait()
 
 
+def color_at(screen, pixels):
+    """The color of a pixel of the window, which alone is on the black screen."""
+    colors = np.asarray(ImageGrab.grab(xdisplay=screen))
+    corner = np.argwhere((colors == 255).all(-1)).min(0)
+    return tuple(colors[corner[0] + round(pixels[1]), corner[1] + round(pixels[0])].tolist())
+
+
+def wait_for_color(screen, pixels, color, seconds=30):
+    """The window draws 30 times a second, or less often on a busy machine."""
+    deadline = time.monotonic() + seconds
+    while (found := color_at(screen, pixels)) != color:
+        assert time.monotonic() < deadline, found
+        time.sleep(0.05)
+
+
 @pytest.mark.skipif(not (shutil.which("Xvfb") and shutil.which("xdotool")), reason="needs Xvfb and xdotool")
-def test_a_real_window_with_a_real_mouse_and_keys(screen, tmp_path):
+def test_a_real_window_with_a_real_mouse_and_keys(screen):
     def xdotool(*words):
         return subprocess.run(["xdotool", *map(str, words)], check=False, capture_output=True, text=True).stdout.strip()
 
@@ -185,14 +200,14 @@ def test_a_real_window_with_a_real_mouse_and_keys(screen, tmp_path):
         xdotool("mousemove", "--window", window, round(x), round(y))
         time.sleep(0.3)
 
-    def wait_for(said, seconds=60):
-        """The window whose title says so: SDL may make another one before it is the last."""
+    def wait_for(words, seconds=60):
+        """The window with these words in its title: SDL may open another one first."""
         deadline = time.monotonic() + seconds
         while True:
             visible = xdotool("search", "--onlyvisible", "--class", ".").split()
             found = {number: xdotool("getwindowname", number) for number in visible}
             for number, title in found.items():
-                if said in title:
+                if words in title:
                     return number
             assert (process.poll(), time.monotonic() < deadline) == (None, True), found
             time.sleep(0.05)
@@ -217,17 +232,9 @@ def test_a_real_window_with_a_real_mouse_and_keys(screen, tmp_path):
         xdotool("mousedown", 1)
         point_at(*there)
         xdotool("mouseup", 1)
-        picture = ImageGrab.grab(xdisplay=screen)
-        picture.save(tmp_path / "window.png")
-        colors = np.asarray(picture)
-        corner = np.argwhere((colors == 255).all(-1)).min(0)  # of the window on the black screen
-
-        def color_at(x, y):
-            return tuple(colors[corner[0] + round(y), corner[1] + round(x)].tolist())
-
-        assert color_at(60, HEADER + 60) == (204, 121, 167)  # the obstacle
-        assert color_at(*there) == (0, 0, 0)  # the waypoint's cross
-        assert color_at(*here) != (0, 0, 0)
+        wait_for_color(screen, there, (0, 0, 0))  # the waypoint's cross
+        wait_for_color(screen, (60, HEADER + 60), (204, 121, 167))  # the obstacle
+        assert color_at(screen, here) != (0, 0, 0)
         point_at(60, HEADER + 60)
         xdotool("click", 1)
         wait_for("1 obstacle,")
@@ -240,5 +247,5 @@ def test_a_real_window_with_a_real_mouse_and_keys(screen, tmp_path):
 
 def test_the_legend_fits():
     game = Game(make_controller("random"), Scenario(n_vehicles=2, n_obstacles=1))
-    header = pygame.surfarray.array3d(game.paint())[SIDE - 6 : SIDE, :HEADER]
+    header = pygame.surfarray.array3d(game.draw())[SIDE - 6 : SIDE, :HEADER]
     assert Image.fromarray(header).convert("L").getextrema()[0] > 200

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from sb3_flock.cli import main
-from sb3_flock.controllers import make_controller
+from sb3_flock.controllers import Controller, make_controller
 from sb3_flock.envs.rendering import HEADER, PALETTE, SIDE
 from sb3_flock.settings import SettingsError
 from sb3_flock.sim import Scenario
@@ -18,28 +18,28 @@ SCENARIO = Scenario(max_cycles=30)
 
 
 @pytest.fixture
-def flyer():
+def controller():
     return make_controller("go-to-waypoint")
 
 
-def test_a_gif_moves_in_the_time_it_should(tmp_path, flyer):
-    path = render(flyer, SCENARIO, tmp_path / "flight.gif", speed=2.0)
-    with Image.open(path) as film:
-        assert film.size == (SIDE, HEADER + SIDE)
-        assert film.n_frames == 31
-        assert film.info["duration"] == 50
-        assert film.info["loop"] == 0
-        first = np.asarray(film.convert("RGB"))
-        film.seek(30)
-        assert (np.asarray(film.convert("RGB")) != first).any(-1).mean() > 0.005
+def test_a_gif_moves_in_the_time_it_should(tmp_path, controller):
+    path = render(controller, SCENARIO, tmp_path / "episode.gif", speed=2.0)
+    with Image.open(path) as video:
+        assert video.size == (SIDE, HEADER + SIDE)
+        assert video.n_frames == 31
+        assert video.info["duration"] == 50
+        assert video.info["loop"] == 0
+        first = np.asarray(video.convert("RGB"))
+        video.seek(30)
+        assert (np.asarray(video.convert("RGB")) != first).any(-1).mean() > 0.005
     for color in PALETTE:
         assert (np.abs(first.astype(int) - color).max(-1) < 12).any()
     assert list(tmp_path.iterdir()) == [path]
 
 
 @pytest.mark.parametrize(("speed", "frames", "fps"), [(1.0, 31, 10), (20.0, 8, 50)])
-def test_an_mp4_is_one(tmp_path, flyer, speed, frames, fps):
-    path = render(flyer, SCENARIO, tmp_path / "flight.mp4", speed=speed)
+def test_an_mp4_is_one(tmp_path, controller, speed, frames, fps):
+    path = render(controller, SCENARIO, tmp_path / "episode.mp4", speed=speed)
     n_frames, _ = imageio_ffmpeg.count_frames_and_secs(str(path))
     assert n_frames == frames
     reader = imageio_ffmpeg.read_frames(str(path))
@@ -51,14 +51,14 @@ def test_an_mp4_is_one(tmp_path, flyer, speed, frames, fps):
 
 
 @pytest.mark.parametrize(("kind", "begin"), [("png", b"\x89PNG"), ("svg", b"<?xml")])
-def test_figures(tmp_path, flyer, kind, begin):
-    path = render(flyer, SCENARIO, tmp_path / f"flight.{kind}")
+def test_figures(tmp_path, controller, kind, begin):
+    path = render(controller, SCENARIO, tmp_path / f"episode.{kind}")
     assert path.read_bytes().startswith(begin)
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_page_holds_everything_in_itself(tmp_path, flyer):
-    path = render(flyer, SCENARIO, tmp_path / "flight.html", title="a < b & c")
+def test_a_page_holds_everything_in_itself(tmp_path, controller):
+    path = render(controller, SCENARIO, tmp_path / "episode.html", title="a < b & c")
     page = path.read_text()
     assert "<h1>a &lt; b &amp; c</h1>" in page
     assert not re.search(r"https?:|<script", page)
@@ -66,8 +66,8 @@ def test_a_page_holds_everything_in_itself(tmp_path, flyer):
 
 
 @pytest.mark.skipif(not shutil.which("chromedriver"), reason="needs Chromium and chromedriver")
-def test_a_page_plays_in_a_browser(tmp_path, flyer):
-    path = render(flyer, SCENARIO, tmp_path / "flight.html", speed=1.0)
+def test_a_page_plays_in_a_browser(tmp_path, controller):
+    path = render(controller, SCENARIO, tmp_path / "episode.html", speed=1.0)
     with Browser() as browser:
         browser.open(path.as_uri())
         player = "const player = document.querySelector('video');"
@@ -79,26 +79,26 @@ def test_a_page_plays_in_a_browser(tmp_path, flyer):
         assert browser.console() == []
 
 
-def test_what_is_wrong_is_told_before_the_flight(tmp_path):
-    class Never:
+def test_mistakes_are_reported_before_the_simulation(tmp_path):
+    class Never(Controller):
         def act(self, sensing, scenario):
             raise AssertionError
 
-    for name, speed, said in (
-        ("flight.avi", 1.0, "ends in .gif, .mp4, .html, .png, .svg"),
-        ("there/flight.gif", 1.0, "there is no folder"),
-        ("flight.gif", float("nan"), "--speed nan"),
+    for name, speed, message in (
+        ("episode.avi", 1.0, "ends in .gif, .mp4, .html, .png, .svg"),
+        ("there/episode.gif", 1.0, "there is no folder"),
+        ("episode.gif", float("nan"), "speed = nan"),
     ):
-        with pytest.raises(SettingsError, match=re.escape(said)):
+        with pytest.raises(SettingsError, match=re.escape(message)):
             render(Never(), SCENARIO, tmp_path / name, speed=speed)
 
 
-def test_an_older_film_stays_if_the_flight_fails(tmp_path):
-    class Fails:
+def test_an_older_video_stays_if_the_simulation_fails(tmp_path):
+    class Fails(Controller):
         def act(self, sensing, scenario):
             raise RuntimeError
 
-    path = tmp_path / "flight.mp4"
+    path = tmp_path / "episode.mp4"
     path.write_bytes(b"older")
     with pytest.raises(RuntimeError):
         render(Fails(), SCENARIO, path)
@@ -107,12 +107,12 @@ def test_an_older_film_stays_if_the_flight_fails(tmp_path):
 
 
 def test_the_command(tmp_path, capsys):
-    path = tmp_path / "flight.gif"
+    path = tmp_path / "episode.gif"
     words = ["render", "ddpg-3v1o", "--n-vehicles", "2", "--set", "max_cycles=3", "--out", str(path)]
     assert main(words) == 0
     assert capsys.readouterr().out == f"{path}\n"
-    with Image.open(path) as film:
-        assert film.n_frames == 4
+    with Image.open(path) as video:
+        assert video.n_frames == 4
     assert main(["render", "--out", str(path)]) == 2
     assert "a POLICY or --controller NAME is needed" in capsys.readouterr().err
     with pytest.raises(SystemExit, match="2"):

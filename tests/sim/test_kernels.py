@@ -1,0 +1,49 @@
+"""The compiled functions against their twins in NumPy; numba's own options are covered by the twins' tests of whole sensings."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sb3_flock.sim import observation, sensing
+
+kernels = pytest.importorskip("sb3_flock.sim.kernels")
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**31), st.integers(1, 3), st.integers(1, 12), st.integers(0, 8), st.floats(0.01, 3.0), st.booleans())
+def test_contacts_are_those_of_numpy(seed, flocks, vehicles, obstacles, sensing_range, exclude_self):
+    rng = np.random.default_rng(seed)
+    positions, bodies = (rng.uniform(-1, 1, (flocks, count, 2)) for count in (vehicles, obstacles))
+    if exclude_self:
+        bodies = positions
+    angles = rng.uniform(-np.pi, np.pi, (flocks, vehicles))
+    frames = np.stack((np.cos(angles), np.sin(angles)), axis=-1)
+    plain = sensing.find_contacts(positions, frames, bodies, sensing_range, exclude_self, use_numba=False)
+    found = kernels.find_contacts(positions, frames, bodies, sensing_range, exclude_self)
+    for values, name in zip(found, ("observers", "bodies", "positions", "distances"), strict=True):
+        np.testing.assert_array_equal(values, getattr(plain, name), err_msg=name)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**31), st.integers(1, 6), st.integers(0, 200), st.sampled_from([2, 5, 11]), st.floats(0.2, 3.0))
+def test_a_rasterized_channel_is_that_of_numpy_whatever_it_held_before(seed, vehicles, n_bodies, side, width):
+    rng = np.random.default_rng(seed)
+    observers = np.sort(rng.integers(0, vehicles, n_bodies))
+    positions = rng.uniform(-0.5, 0.5, (n_bodies, 2))
+    positions[rng.random(n_bodies) < 0.05] *= 1e4  # far outside the channel
+    radius = 0.3
+    sigma = width * 2 * radius / (side - 1)
+    fast, plain = (rng.normal(size=(vehicles, 3, side, side)).astype(np.float32) for _ in range(2))
+    untouched = fast[:, [0, 2]].copy()
+    kernels.rasterize(fast, 1, observers, positions, radius, sigma, (0,) * side)
+    observation.rasterize(plain, 1, observers, positions, radius, sigma)
+    np.testing.assert_allclose(fast[:, 1], plain[:, 1], rtol=1e-5, atol=1e-20)
+    np.testing.assert_array_equal(fast[:, [0, 2]], untouched)
+
+
+@pytest.mark.parametrize(
+    ("exponent", "tolerance"), [(0.0, 0.0), (1.0, 3e-13), (-80.0, 3e-13), (100.0, 3e-13), (-300.0, 2e-9), (-500.0, 4e-7)]
+)
+def test_the_vectorized_exponential(exponent, tolerance):
+    assert kernels._exp(exponent) == pytest.approx(np.exp(exponent), rel=tolerance, abs=0.0)
