@@ -108,6 +108,28 @@ _MODULES = {
 
 _MEMBERS = {
     "AdvisedSamples": "rl.buffers:ExpertReplayBufferSamples",
+    "EARLIER_INPUTS": "deploy.onnx_export:PREVIOUS_INPUTS",
+    "Export": "deploy.onnx_export:ExportResult",
+    "FILMS": "viz.video:VIDEO_WRITERS",
+    "Flight": "viz.figures:Trajectory",
+    "LINK": "controllers.mpc_kernels:UNIT_LINK",
+    "Picture": "viz.video:Frame",
+    "Situation": "deploy.onnx_export:SampleInput",
+    "Teacher": "controllers.base:Controller",
+    "Wants": "controllers.mpc_kernels:CostParams",
+    "check_film": "viz.video:check_video",
+    "curves_figure": "viz.compare:plot_curves",
+    "descend": "controllers.mpc_kernels:optimize",
+    "flights": "viz.figures:plot_side_by_side",
+    "inexactness": "training.checkpoint:reproducibility_warnings",
+    "locked": "training.run_dir:lock_run_dir",
+    "new_run_folder": "training.run_dir:create_run_dir",
+    "observation": "viz.figures:plot_observation",
+    "random_situations": "deploy.onnx_export:random_sample_inputs",
+    "slope": "controllers.mpc_kernels:cost_gradient",
+    "surroundings": "training.checkpoint:runtime_info",
+    "told_once": "training.logger:quiet_writer_thread",
+    "write_whole": "serialization.save:atomic_write",
     "Checkpoints": "training.checkpoint_callback:CheckpointCallback",
     "Controller": "controllers.base:Controller",
     "DemonstratedActions": "rl.callbacks:StoreExecutedActions",
@@ -143,6 +165,19 @@ _MEMBERS = {
 }
 """Old members of those modules to new ones, where name or module changed by more than the module itself."""
 
+_MEMBERS_OF_KEPT_MODULES = {
+    "evaluation": {
+        "Controller": "controllers.base:Controller",
+        "PolicyController": "controllers.policy:PolicyController",
+        "fly": "evaluation.rollout:rollout",
+    },
+    "rl.callbacks": {
+        "DemonstratedActions": "rl.callbacks:StoreExecutedActions",
+        "FadingNoise": "rl.callbacks:LinearNoiseDecay",
+    },
+}
+"""Old members of modules whose names stay."""
+
 
 def warn_renamed(what: str, now: str, stacklevel: int = 2) -> None:
     """One line that names the new name.
@@ -177,6 +212,19 @@ def rename_key(key: str) -> str:
     flat = {old: new for owner in ("Scenario", "TrainingConfig", "TrainEnvConfig", "MPCConfig", "AlgorithmConfig")
             for old, new in FIELDS[owner].items()}  # fmt: skip
     return ".".join(flat.get(part, part) for part in key.split("."))
+
+
+def renamed_member(module: str, name: str) -> Any:
+    """What an old member of a module whose name stays is now; the module's ``__getattr__`` calls this.
+
+    :raises AttributeError: if the module had no such member
+    """
+    target = _MEMBERS_OF_KEPT_MODULES[module.removeprefix("sb3_flock.")].get(name)
+    if target is None:
+        raise AttributeError(f"module {module!r} has no attribute {name!r}")
+    now, _, member = target.partition(":")
+    warn_renamed(f"{module}.{name}", f"sb3_flock.{now}.{member}", stacklevel=3)
+    return getattr(importlib.import_module(f"sb3_flock.{now}"), member)
 
 
 class _RenamedModule(ModuleType):

@@ -129,7 +129,10 @@ class TrainingConfig(ModelSettings, TaskConfig):
     )
     save_freq: Count = Field(25_000, description="transitions between checkpoints; 0: none")
     keep_checkpoints: int = Field(
-        2, ge=1, le=1_000_000, description="number of newest checkpoints to keep; a resumed training continues from the newest"
+        2,
+        ge=1,
+        le=1_000_000,
+        description="number of newest checkpoints to keep; a resumed training continues from the newest",
     )
     init_from: str | None = Field(None, description="policy (zip or run folder) with the initial weights; null: random")
     output_dir: str = Field("runs", description="folder in which run folders are created")

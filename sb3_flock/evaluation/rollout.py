@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_flock._renamed import warn_renamed
 from sb3_flock.controllers import Controller
 from sb3_flock.controllers.policy import PolicyController
 from sb3_flock.evaluation.metrics import EpisodeMetrics, Metric, summarize
@@ -89,9 +90,26 @@ def as_controller(policy: Any, scenario: Scenario) -> Controller:
         return policy
     if isinstance(policy, LoadedPolicy):
         policy.check(scenario)
+    if callable(getattr(policy, "act", None)):  # accepted without the base class by the previous release
+        warn_renamed(f"{type(policy).__name__} without a base class", "to be a subclass of Controller")
+        return _Adapter(policy)
     if not callable(getattr(policy, "predict", None)):
         raise SettingsError(f"policy = {type(policy).__name__}: a Controller, or an object with SB3's predict, is needed")
     return PolicyController(policy)
+
+
+class _Adapter(Controller):
+    """A controller of the previous release, which needed no base class."""
+
+    def __init__(self, controller: Any) -> None:
+        self.controller = controller
+
+    def reset(self, rngs: Sequence[np.random.Generator], scenario: Scenario) -> None:
+        getattr(self.controller, "reset", super().reset)(rngs, scenario)
+
+    def act(self, sensing: Sensing, scenario: Scenario) -> NDArray[np.floating]:
+        actions: NDArray[np.floating] = self.controller.act(sensing, scenario)
+        return actions
 
 
 def evaluate(

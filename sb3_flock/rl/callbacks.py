@@ -11,6 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNoise
 
 from sb3_flock._compat import progress_remaining, set_noise_std
+from sb3_flock._renamed import renamed_member
 from sb3_flock.settings import RunError, SettingsError
 from sb3_flock.sim import mix_rewards
 
@@ -182,3 +183,7 @@ class StopOnNonFiniteLoss(BaseCallback):
                     f"{name} = {value} after {self.num_timesteps} transitions: the training diverged; a smaller "
                     "learning_rate or reward scale may help"
                 )
+
+
+def __getattr__(name: str) -> Any:
+    return renamed_member(__name__, name)
