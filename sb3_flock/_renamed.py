@@ -8,6 +8,7 @@ from __future__ import annotations
 import importlib
 import importlib.abc
 import importlib.machinery
+import operator
 import sys
 import warnings
 from collections.abc import Mapping, Sequence
@@ -175,6 +176,7 @@ _MEMBERS_OF_KEPT_MODULES = {
         "DemonstratedActions": "rl.callbacks:StoreExecutedActions",
         "FadingNoise": "rl.callbacks:LinearNoiseDecay",
     },
+    "sim": {"sense": "sim.world:World.sense"},
 }
 """Old members of modules whose names stay."""
 
@@ -224,7 +226,7 @@ def renamed_member(module: str, name: str) -> Any:
         raise AttributeError(f"module {module!r} has no attribute {name!r}")
     now, _, member = target.partition(":")
     warn_renamed(f"{module}.{name}", f"sb3_flock.{now}.{member}", stacklevel=3)
-    return getattr(importlib.import_module(f"sb3_flock.{now}"), member)
+    return operator.attrgetter(member)(importlib.import_module(f"sb3_flock.{now}"))
 
 
 class _RenamedModule(ModuleType):
@@ -258,4 +260,4 @@ class _RenamedModules(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 def install() -> None:
     """Let old module names be imported."""
     if not any(isinstance(finder, _RenamedModules) for finder in sys.meta_path):
-        sys.meta_path.append(_RenamedModules())
+        sys.meta_path.insert(0, _RenamedModules())  # first: an old folder with caches may be left in a checkout

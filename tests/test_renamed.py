@@ -288,3 +288,40 @@ def test_an_old_policy_acts_as_before():
     with pytest.warns(RenamedWarning):
         old, _ = load_policy("paper-3v1o").predict(observations)
     np.testing.assert_array_equal(old, load_policy("ddpg-3v1o").predict(observations)[0])
+
+
+@pytest.mark.parametrize(
+    ("module", "name"),
+    [(module, name) for module, names in _renamed._MEMBERS_OF_KEPT_MODULES.items() for name in names],
+)
+def test_an_old_member_of_a_module_whose_name_stays_warns_and_works(module, name):
+    home = importlib.import_module(f"sb3_flock.{module}")
+    with pytest.warns(RenamedWarning, match=rf"sb3_flock\.{module}\.{name} is now"):
+        assert callable(getattr(home, name))
+    with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
+        home.nothing  # noqa: B018
+
+
+def test_the_old_sense_of_a_world_still_works():
+    from sb3_flock.sim import World, episode_rng
+
+    with pytest.warns(RenamedWarning):
+        from sb3_flock.sim import sense
+    world = World(Scenario())
+    sensing = world.reset([episode_rng(0, 0)])
+    np.testing.assert_array_equal(sense(world).waypoint_positions, sensing.waypoint_positions)
+
+
+def test_a_controller_without_the_base_class_warns_and_works():
+    from sb3_flock.evaluation import evaluate
+
+    class Standing:
+        def reset(self, rngs, scenario):
+            self.shape = (len(rngs), scenario.n_vehicles, 2)
+
+        def act(self, sensing, scenario):
+            return np.zeros(self.shape)
+
+    with pytest.warns(RenamedWarning, match="Standing"):
+        metrics = evaluate(Standing(), Scenario(max_cycles=5), episodes=3)
+    assert metrics["tracking_error"].n == 3

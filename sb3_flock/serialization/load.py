@@ -80,6 +80,7 @@ class LoadedPolicy:
             "link_range",
             "detection_range",
             "channel_radii",
+            "extra_channels",
             "anchor_width",
             "motion_lag",
             "max_speed",

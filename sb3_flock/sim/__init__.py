@@ -1,5 +1,8 @@
 """The task: vehicles, obstacles and waypoint, what a vehicle senses, observes and is rewarded for. NumPy, numba if installed."""
 
+from typing import Any
+
+from sb3_flock._renamed import renamed_member
 from sb3_flock.sim.observation import Channel, observe, register_channel
 from sb3_flock.sim.reward import RewardWeights, mix_rewards, own_reward, register_reward_term, reward_terms
 from sb3_flock.sim.scenario import Scenario
@@ -21,3 +24,7 @@ __all__ = [
     "register_reward_term",
     "reward_terms",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    return renamed_member(__name__, name)
