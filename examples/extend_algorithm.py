@@ -23,7 +23,7 @@ def tqc_networks(network):
 register_algorithm("tqc", AlgorithmSpec(TQC, TQCPolicy, tqc_networks, has_action_noise=False))
 
 steps = int(sys.argv[1]) if len(sys.argv) > 1 else 100_000
-config = TrainingConfig(algo="tqc", total_timesteps=steps, eval_freq=0)
+config = TrainingConfig(algo="tqc", algorithm={"learning_starts": 2000}, total_timesteps=steps, n_flocks=8, eval_freq=0)
 result = train(config)
 policy = load_policy(result.folder)  # no code from the file is run; a script that loads it registers the algorithm first
 print(f"{Path(result.folder).name}: {type(policy.policy).__name__} after {policy.num_timesteps} transitions")

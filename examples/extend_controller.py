@@ -31,8 +31,8 @@ class PotentialField(Controller):
 register_expert("potential-field", lambda world, mpc: PotentialField())
 
 steps = int(sys.argv[1]) if len(sys.argv) > 1 else 150_000
-settings = {"train_env": {"expert": "potential-field"}, "algorithm": {"bc_coef": 1.0}}
-student = load_policy(train(TrainingConfig(**settings, total_timesteps=steps, eval_freq=0)).folder)
+settings = {"train_env": {"expert": "potential-field"}, "algorithm": {"bc_coef": 1.0, "learning_starts": 2000}}
+student = load_policy(train(TrainingConfig(**settings, total_timesteps=steps, n_flocks=8, eval_freq=0)).folder)
 for name in ("potential-field", "orca", "student"):
     metrics = evaluate(student if name == "student" else make_controller(name), student.scenario, episodes=50)
     print(f"{name:>15}: tracking error {metrics['tracking_error'].mean:.3f} m, ", end="")

@@ -16,13 +16,14 @@ def spacing(sensing, actions, ranges):
 
 reward = {"extra_terms": {"spacing": 20.0}}
 env = flocking_v0.parallel_env(Scenario(n_vehicles=3, arena=0.12, obstacle_arena=0.6, reward=reward))
-env.reset(seed=0)
+env.reset(seed=1)
 _, _, _, _, infos = env.step({agent: np.array([0.1, 0.0]) for agent in env.agents})
 for agent, info in infos.items():
     print(agent, {name: round(term, 4) for name, term in info["reward_terms"].items()})
 
 steps = int(sys.argv[1]) if len(sys.argv) > 1 else 150_000
-trained = load_policy(train(TrainingConfig(scenario={"reward": reward}, total_timesteps=steps, eval_freq=0)).folder)
+config = TrainingConfig(scenario={"reward": reward}, total_timesteps=steps, n_flocks=8, eval_freq=0)
+trained = load_policy(train(config).folder)
 for name, policy in (("with the term", trained), ("without it, ddpg-3v1o", load_policy("ddpg-3v1o"))):
     separation = evaluate(policy, trained.scenario, episodes=50)["mean_separation_linked"].mean
     print(f"{name}: mean distance of linked vehicles {'none' if separation is None else f'{separation:.4f} m'}")
