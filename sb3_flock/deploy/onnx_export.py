@@ -132,17 +132,18 @@ class OnnxPolicy(nn.Module):
             in_range = _norm(measured) < ranges.get(channel.source, float("inf"))
             if channel.source == "waypoint":
                 positions = positions / (_norm(positions) / radius).clamp(min=1.0)[:, None]
-            if channel.select is not None:
-                in_range = in_range & channel.select(positions)
             marked.append(nn.functional.pad(positions, (0, 1), value=float(number)))
             shown.append(in_range)
-        positions, channel_of = th.cat(marked)[:, :2], th.cat(marked)[:, 2].long()
+        positions, channel_of, visible = th.cat(marked)[:, :2], th.cat(marked)[:, 2].long(), th.cat(shown)
+        for number, channel in enumerate(scenario.channels):
+            if channel.select is not None:  # of all bodies at once: onnxruntime fails on a selection of none
+                visible = visible & ((channel_of != number) | channel.select(positions))
         radii = th.tensor(scenario.channel_radii, dtype=th.float64)
         anchors = th.linspace(-1, 1, side, dtype=th.float64) * (side - 1) / (2 * scenario.anchor_width)
         sigma = scenario.anchor_width * 2 * radii / (side - 1)
         factors = th.exp(-0.5 * ((positions / sigma[channel_of, None])[:, :, None] - anchors).square())
         gaussians = (factors[:, 0, :, None] * factors[:, 1, None, :]).flatten(1)
-        counts = (channel_of == th.arange(len(radii))[:, None]) & th.cat(shown)
+        counts = (channel_of == th.arange(len(radii))[:, None]) & visible
         return (counts.double() @ gaussians).view(len(radii), side, side)
 
 

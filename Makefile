@@ -1,0 +1,16 @@
+.PHONY: install test lint bench ci
+
+install: ## an environment with everything that the tests need
+	python3 -m venv .venv && .venv/bin/pip install -q -e ".[dev]"
+
+test: ## all tests but the slow ones, on all cores
+	.venv/bin/python -m pytest -q -n auto --dist loadfile
+
+lint: ## style, types and layers
+	.venv/bin/ruff check . && .venv/bin/ruff format --check . && .venv/bin/mypy && .venv/bin/lint-imports
+
+bench: ## speed of the simulation and of an update, written to benchmarks.json
+	.venv/bin/python -m pytest tests/benchmarks --benchmark-enable --benchmark-json=benchmarks.json
+
+ci: ## everything that must pass before a change lands
+	.ci/run

@@ -1,0 +1,1 @@
+"""Figures, video and the window: how rollouts and trainings look."""
