@@ -254,7 +254,7 @@ def test_every_policy_of_format_2_loads_with_its_task_and_its_weights(name, tmp_
     assert member["format"] == 2
     assert policy.scenario.motion_lag == old["scenario"].get("look_back", 0.0)
     assert policy.config.algorithm.bc_coef == old["learner"].get("guidance", 0.0)
-    assert policy.config.train_env.flock_sizes == tuple(old["practice"]["vehicles"])
+    assert policy.config.train_env.flock_sizes == tuple(np.atleast_1d(old["practice"]["vehicles"]))
     assert policy.num_timesteps == member["num_timesteps"]
     state = policy.policy.state_dict()
     assert state.keys() == tensors.keys()
