@@ -1,7 +1,5 @@
-import os
 import signal
 import threading
-import time
 
 import pytest
 
@@ -79,8 +77,7 @@ def test_in_another_thread_nothing_is_delayed():
     entered.wait(10)
     try:
         with pytest.raises(KeyboardInterrupt):
-            os.kill(os.getpid(), signal.SIGINT)
-            time.sleep(5)
+            signal.raise_signal(signal.SIGINT)
     finally:
         leave.set()
         thread.join()

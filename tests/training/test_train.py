@@ -1,6 +1,5 @@
 """Smoke trainings of every algorithm, and what a run folder holds."""
 
-import io
 import json
 import signal
 import zipfile
@@ -8,7 +7,6 @@ import zipfile
 import numpy as np
 import pytest
 import torch as th
-from rich.console import Console
 
 from sb3_flock import evaluate, load_policy, train
 from sb3_flock.config.training import TrainingConfig
@@ -138,7 +136,9 @@ def test_a_zip_holds_its_task_and_versions_and_a_policy_drives_any_number(tmp_pa
     with pytest.warns(UserWarning, match=r"trained with link_range = 0\.2, evaluated with 0\.15"):
         evaluate(policy, policy.scenario.replace(link_range=0.15), episodes=1)
     for change in ({"n_anchors": 9}, {"motion_lag": 0.2}):
-        with pytest.raises(PolicyError, match=r"its observations have the shape \(3, 11, 11\), the scenario's \(n_anchors = "):
+        with pytest.raises(
+            PolicyError, match=r"its observations have the shape \(3, 11, 11\), the scenario's \(n_anchors = "
+        ):
             evaluate(policy, policy.scenario.replace(**change), episodes=1)
 
 
