@@ -1,4 +1,4 @@
-"""A features extractor of your own in place of FlockCNN: here, without a convolution."""
+"""A features extractor of your own in place of FlockCNN: here, one without convolutions."""
 
 import sys
 
@@ -11,7 +11,7 @@ from sb3_flock import FlockPolicy, NeighborInclusiveReward, Scenario, evaluate, 
 
 
 class FlatMLP(BaseFeaturesExtractor):
-    """Flattens the tensor and passes it through one dense layer; an extractor may be any torch module of this form."""
+    """Flattens the observation and passes it through one dense layer; an extractor may be any torch module of this form."""
 
     def __init__(self, observation_space, features_dim=128):
         super().__init__(observation_space, features_dim)

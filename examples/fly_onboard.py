@@ -1,6 +1,6 @@
 """One vehicle's own computer: numpy and onnxruntime alone, with a policy from ``sb3-flock export ddpg-5v2o policy.onnx``.
 
-The radio and the sensors are yours; here they are played by a small world of points.
+On a real vehicle the positions come from the radio and the sensors; here a small simulated world of points gives them.
 """
 
 import json
@@ -10,37 +10,38 @@ import numpy as np
 import onnxruntime
 
 options = onnxruntime.SessionOptions()
-options.intra_op_num_threads = 1  # one core is plenty
+options.intra_op_num_threads = 1  # one core is enough
 policy = onnxruntime.InferenceSession(sys.argv[1], options)
 task = json.loads(policy.get_modelmeta().custom_metadata_map["sb3_flock"])
 
-position, heading = np.array([-0.6, -0.4]), 0.0  # of this vehicle, known to no one but this world
+position, heading = np.array([-0.6, -0.4]), 0.0  # of this vehicle; the policy does not get them
 neighbors, obstacles = np.array([[0.1, 0.0], [-0.1, 0.05]]), np.array([[-0.3, -0.2]])
 waypoint = np.zeros(2)
 
 
-def seen_from(place, facing, points):
-    """Positions in the frame of a body there, forward is +x, left is +y [m]."""
-    cos, sin = np.cos(facing), np.sin(facing)
-    return (np.atleast_2d(points) - place) @ np.array([[cos, -sin], [sin, cos]])
+def in_body_frame(origin, angle, points):
+    """Positions in the frame of a body at ``origin`` with heading ``angle``: forward is +x, left is +y [m]."""
+    cos, sin = np.cos(angle), np.sin(angle)
+    return (np.atleast_2d(points) - origin) @ np.array([[cos, -sin], [sin, cos]])
 
 
 def measured(points):
-    """What the sensors give."""
-    return seen_from(position, heading, points)
+    """What the sensors measure."""
+    return in_body_frame(position, heading, points)
 
 
-looks = []  # what was measured, where and facing where: only the policies with a second look need it
-steps_back = round(task["motion_lag"] / task["time_step"])
+history = []  # measurements with this vehicle's position and heading; only policies with motion channels need it
+lag_steps = round(task["motion_lag"] / task["time_step"])
 
 for step in range(100):
     now = {"neighbors": measured(neighbors), "obstacles": measured(obstacles), "waypoint": measured(waypoint)[0]}
-    looks = [*looks, (now, position, heading)][-1 - steps_back :]
+    history = [*history, (now, position, heading)][-1 - lag_steps :]
     inputs = now
-    if steps_back:
-        before, place, facing = looks[0]
-        ego_motion = np.append(seen_from(place, facing, position)[0], heading - facing)  # by odometry
-        inputs = {**now, **{f"{name}_before": points for name, points in before.items()}, "moved": moved}
+    if lag_steps:
+        before, origin, angle = history[0]
+        ego_motion = np.append(in_body_frame(origin, angle, position)[0], heading - angle)  # from odometry
+        previous = {f"previous_{name}": points for name, points in before.items()}
+        inputs = {**now, **previous, "ego_motion": ego_motion}
     (speed, turn_rate), *_ = policy.run(None, inputs)  # m/s, rad/s, to hold for one sampling period
     position = position + speed * task["time_step"] * np.array([np.cos(heading), np.sin(heading)])
     heading += turn_rate * task["time_step"]

@@ -1,6 +1,6 @@
-"""The neighbor-inclusive reward on somebody else's env: MPE2's simple_spread (pip install mpe2 pillow).
+"""The neighbor-inclusive reward on another env: MPE2's simple_spread (pip install mpe2 pillow).
 
-All the callback needs is ``info["neighbors"]``: the indices into ``possible_agents`` of each agent's neighbors.
+The callback needs only ``info["neighbors"]``: the indices into ``possible_agents`` of each agent's neighbors.
 """
 
 import sys
@@ -15,7 +15,7 @@ from sb3_flock import NeighborInclusiveReward, flatten
 
 
 class NeighborsWithinOne(BaseParallelWrapper):
-    """Everyone within distance 1 of an agent is its neighbor."""
+    """The neighbors of an agent are the agents within distance 1."""
 
     def step(self, actions):
         observations, rewards, terminations, truncations, infos = super().step(actions)

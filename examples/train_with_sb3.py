@@ -1,4 +1,4 @@
-"""Train a flock in your own Stable-Baselines3 script: the parts of sb3_flock in plain DDPG."""
+"""Train a flock in a Stable-Baselines3 script of your own: plain DDPG with the parts of sb3_flock."""
 
 import sys
 
@@ -13,7 +13,7 @@ scenario = Scenario(n_vehicles=3, n_obstacles=1)
 model = DDPG(
     "MlpPolicy",
     make_vec_env(scenario, n_flocks=8, seed=0),
-    policy_kwargs=dict(features_extractor_class=FlockCNN, features_extractor_kwargs=dict(layer_norm=True), net_arch=[64]),
+    policy_kwargs=dict(features_extractor_class=FlockCNN, net_arch=[64]),
     action_noise=NormalActionNoise(np.zeros(2), np.full(2, 0.3)),
     learning_rate=5e-4,
     gamma=0.98,

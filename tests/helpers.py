@@ -1,6 +1,7 @@
 """What several test modules share: tiny trainings, worlds placed by hand, and comparisons of states."""
 
 import io
+from pathlib import Path
 
 import numpy as np
 import torch as th
@@ -11,7 +12,7 @@ from sb3_flock.evaluation.rollout import rollout_batch
 from sb3_flock.serialization.load import checkpoint_paths
 from sb3_flock.serialization.yaml_io import load_config
 from sb3_flock.sim import World, episode_rng
-from sb3_flock.training.checkpoint import LoadedCheckpoint
+from sb3_flock.training.checkpoint import LoadedCheckpoint, runtime_info
 
 TINY = {
     "total_timesteps": 300, "n_flocks": 2, "eval_freq": 120, "n_eval_episodes": 2, "save_freq": 150, "max_cycles": 20,
@@ -92,3 +93,18 @@ def flat(tree, name=""):
             yield from flat(value, f"{name}/{index}")
     else:
         yield name, tree.detach().numpy() if isinstance(tree, th.Tensor) else tree
+
+
+DATA = Path(__file__).parent / "data"
+"""Files of earlier releases, and what those releases computed with them."""
+
+
+def same_machine(recorded):
+    """Whether this machine gives the bits that were computed with a recorded ``runtime_info``."""
+    now = runtime_info(TrainingConfig())
+    return all(recorded[name] == now[name] for name in recorded if name != "sb3_flock")
+
+
+def recorded_machine():
+    """The ``runtime_info`` with which the files in :data:`DATA` were made, as a checkpoint among them has it."""
+    return LoadedCheckpoint(DATA / "format_2/runs/ddpg/rl_model_400_steps.zip", 10**8).runtime_info

@@ -1,4 +1,4 @@
-"""Every example runs, shortened by its own argument."""
+"""Every example runs, with an argument that makes it short."""
 
 import re
 import subprocess
@@ -26,12 +26,12 @@ def test_the_sb3_script_is_short_trains_and_saves(tmp_path):
     assert len([line for line in code if line.strip() and not line.startswith('"""')]) < 25
 
 
-def test_another_env(tmp_path):
+def test_neighbors_of_another_env(tmp_path):
     assert "2004 transitions" in run("neighbors_of_another_env.py", 2000, cwd=tmp_path)
     assert (tmp_path / "neighbors_of_another_env.png").exists()
 
 
-def test_evaluating_a_policy(tmp_path):
+def test_evaluating_a_policy_in_other_flock_sizes(tmp_path):
     words = ["train", "--total-timesteps", "60", "--eval-freq", "0", "--output-dir", str(tmp_path)]
     assert main([*words, "--set", "n_test_episodes=1", "--set", "buffer_size=100"]) == 0
     assert run("evaluate_policy.py", tmp_path / "ddpg_3v1o_1", cwd=tmp_path).count("vehicles:") == 4
@@ -39,29 +39,29 @@ def test_evaluating_a_policy(tmp_path):
 
 
 def test_a_custom_extractor_trains(tmp_path):
-    said = run("custom_extractor.py", 1200, cwd=tmp_path)
-    assert "FlatMLP" in said
-    assert "tracking error" in said
+    output = run("custom_extractor.py", 1200, cwd=tmp_path)
+    assert "FlatMLP" in output
+    assert "tracking error" in output
     assert (tmp_path / "custom_extractor.png").exists()
 
 
-def test_a_policy_beside_olfati_saber(tmp_path):
-    said = run("beside_olfati_saber.py", "ddpg-3v1o", 10, cwd=tmp_path)
-    assert [line.split(":")[0].strip() for line in said.splitlines()] == ["ours", "Olfati-Saber"]
+def test_a_policy_and_a_baseline_controller_on_the_same_episodes(tmp_path):
+    output = run("beside_olfati_saber.py", "ddpg-3v1o", 10, cwd=tmp_path)
+    assert [line.split(":")[0].strip() for line in output.splitlines()] == ["ours", "Olfati-Saber"]
     assert (tmp_path / "beside_olfati_saber.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_parameter_sharing(tmp_path):
-    said = run("parameter_sharing.py", cwd=tmp_path)
-    assert "decided alone, the same: True" in said
-    assert "[[1" in said
+    output = run("parameter_sharing.py", cwd=tmp_path)
+    assert "computed alone, the same: True" in output
+    assert "[[1" in output
 
 
 @pytest.mark.parametrize("policy", ["ddpg-5v2o", "ddpg-bc-5v2o"])
-def test_flying_on_board_needs_numpy_and_onnxruntime_alone(tmp_path, policy):
+def test_the_onboard_example_needs_numpy_and_onnxruntime_alone(tmp_path, policy):
     assert main(["export", policy, str(tmp_path / "policy.onnx")]) == 0
-    said = run("fly_onboard.py", tmp_path / "policy.onnx", cwd=tmp_path)
-    last = [float(number) for number in re.findall(r"([\d.]+) m ", said.splitlines()[-1])]
+    output = run("fly_onboard.py", tmp_path / "policy.onnx", cwd=tmp_path)
+    last = [float(number) for number in re.findall(r"([\d.]+) m ", output.splitlines()[-1])]
     assert last[0] < 0.15
     assert last[1] >= 0.1
     assert last[2] >= 0.15
@@ -69,7 +69,7 @@ def test_flying_on_board_needs_numpy_and_onnxruntime_alone(tmp_path, policy):
     assert imported <= {"json", "sys", "numpy", "onnxruntime"}
 
 
-def test_no_example_is_left_out():
+def test_every_example_has_a_test():
     source = Path(__file__).read_text()
     for path in EXAMPLES.glob("*.py"):
         assert path.name in source

@@ -51,7 +51,7 @@ class FlockCNN(BaseFeaturesExtractor):
         for layer, out_channels in enumerate(channels):
             if kernel_size > side:
                 raise SettingsError(
-                    f"FlockCNN: {len(channels)} convolutions of kernel {kernel_size} and stride {stride} do not fit a "
+                    f"FlockCNN: {len(channels)} convolutions of kernel {kernel_size} and stride {stride} do not fit an "
                     f"observation of {observation_space.shape[1:]} anchors; more anchors or a smaller kernel are needed"
                 )
             layers += [nn.Conv2d(in_channels, out_channels, kernel_size, stride), nn.ReLU()]

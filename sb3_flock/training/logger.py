@@ -22,7 +22,7 @@ def make_logger(folder: Path, num_timesteps: int) -> Logger:
     if num_timesteps:
         assert tensorboard.writer is not None
         tensorboard.writer.close()
-        tensorboard.writer = SummaryWriter(log_dir=str(folder), purge_step=num_timesteps)
+        tensorboard.writer = SummaryWriter(log_dir=str(folder), purge_step=num_timesteps + 1)
     return Logger(str(folder), [tensorboard, _ContinuedCSV(folder / "progress.csv", num_timesteps)])
 
 

@@ -1,10 +1,14 @@
 import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 
 from sb3_flock import CompactReplayBuffer, Scenario
+from sb3_flock._renamed import RenamedWarning
 from sb3_flock.envs.flocking_v0 import action_space, observation_space
+from sb3_flock.rl.buffers import load_replay_state, replay_state
+from sb3_flock.settings import SettingsError
 
 SPACES = observation_space(Scenario()), action_space(Scenario())
 N_ENVS = 4
@@ -19,11 +23,11 @@ def fill(buffer, steps, seed=0):
 
     observations = draw()
     for _ in range(steps):
-        after, done, timeout = draw(), rng.random(N_ENVS) < 0.1, rng.random(N_ENVS) < 0.5
-        first = np.where(done[:, None, None, None], draw(), after)  # of the next episode where one ended
+        next_observations, done, timeout = draw(), rng.random(N_ENVS) < 0.1, rng.random(N_ENVS) < 0.5
+        first = np.where(done[:, None, None, None], draw(), next_observations)  # of the next episode where one ended
         actions, rewards = rng.normal(size=(N_ENVS, 2)).astype(np.float32), rng.normal(size=N_ENVS).astype(np.float32)
         infos = [{"TimeLimit.truncated": bool(d and t)} for d, t in zip(done, timeout, strict=True)]
-        buffer.add(observations, after, actions, rewards, done, infos)
+        buffer.add(observations, next_observations, actions, rewards, done, infos)
         observations = first
 
 
@@ -33,11 +37,11 @@ def samples(buffer, seed=0):
 
 
 @pytest.mark.parametrize("steps", [1, 30])
-def test_it_returns_what_sb3s_buffer_returns_but_for_the_last_digits(steps):
-    compact, stock = (kind(400, *SPACES, device="cpu", n_envs=N_ENVS) for kind in (CompactReplayBuffer, ReplayBuffer))
+def test_samples_equal_those_of_sb3s_buffer_up_to_rounding(steps):
+    compact, sb3 = (kind(400, *SPACES, device="cpu", n_envs=N_ENVS) for kind in (CompactReplayBuffer, ReplayBuffer))
     fill(compact, steps)
-    fill(stock, steps)
-    ours, theirs = samples(compact), samples(stock)
+    fill(sb3, steps)
+    ours, theirs = samples(compact), samples(sb3)
     for name in ("actions", "dones", "rewards"):
         th.testing.assert_close(getattr(ours, name), getattr(theirs, name), rtol=0, atol=0)
     for name in ("observations", "next_observations"):
@@ -45,29 +49,47 @@ def test_it_returns_what_sb3s_buffer_returns_but_for_the_last_digits(steps):
         assert getattr(ours, name).dtype == th.float32
 
 
-@pytest.mark.parametrize("mirror", [False, True])
-def test_advice_comes_with_its_transition_scaled_and_mirrored_as_the_action_is(mirror):
-    buffer = CompactReplayBuffer(80, *SPACES, device="cpu", n_envs=N_ENVS, mirror=mirror, advice=True)
+def test_mirror_augmentation_mirrors_half_of_a_sample_left_for_right():
+    plain, mirrored = (
+        CompactReplayBuffer(400, *SPACES, device="cpu", n_envs=N_ENVS, mirror_augmentation=option)
+        for option in (False, True)
+    )
+    fill(plain, 30)
+    fill(mirrored, 30)
+    expected, batch = samples(plain), samples(mirrored)
+    for name in ("observations", "next_observations"):
+        first, second = getattr(batch, name).split(100)
+        th.testing.assert_close(first, getattr(expected, name)[:100].flip(-1), rtol=0, atol=0)
+        th.testing.assert_close(second, getattr(expected, name)[100:], rtol=0, atol=0)
+    turned = th.cat([th.tensor([1.0, -1.0]).expand(100, 2), th.ones(100, 2)])
+    th.testing.assert_close(batch.actions, expected.actions * turned, rtol=0, atol=0)
+    th.testing.assert_close(batch.rewards, expected.rewards, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("mirror_augmentation", [False, True])
+def test_expert_actions_are_scaled_and_mirrored_with_their_transition(mirror_augmentation):
+    options = {"mirror_augmentation": mirror_augmentation, "store_expert_actions": True}
+    buffer = CompactReplayBuffer(80, *SPACES, device="cpu", n_envs=N_ENVS, **options)
     space, rng = SPACES[1], np.random.default_rng(0)
-    tensors = np.zeros((N_ENVS, *SPACES[0].shape), np.float32)
+    observations = np.zeros((N_ENVS, *SPACES[0].shape), np.float32)
     for _ in range(33):
         actions = rng.uniform(-1, 1, (N_ENVS, 2)).astype(np.float32)
-        infos = [{"advice": space.low + (action + 1) / 2 * (space.high - space.low)} for action in actions]
-        buffer.add(tensors, tensors, actions, np.zeros(N_ENVS), np.zeros(N_ENVS, bool), infos)
+        infos = [{"expert_action": space.low + (action + 1) / 2 * (space.high - space.low)} for action in actions]
+        buffer.add(observations, observations, actions, np.zeros(N_ENVS), np.zeros(N_ENVS, bool), infos)
     batch = samples(buffer)
-    th.testing.assert_close(batch.advice, batch.actions, rtol=0, atol=1e-6)
-    assert len(batch.advice.unique(dim=0)) > 50
+    th.testing.assert_close(batch.expert_actions, batch.actions, rtol=0, atol=1e-6)
+    assert len(batch.expert_actions.unique(dim=0)) > 50
 
 
-def test_once_full_it_holds_the_newest_transitions_and_the_right_next_observations():
-    compact, everything = (
+def test_a_full_buffer_holds_the_newest_transitions_and_their_next_observations():
+    compact, large = (
         CompactReplayBuffer(80, *SPACES, device="cpu", n_envs=N_ENVS),
         ReplayBuffer(400, *SPACES, device="cpu", n_envs=N_ENVS),
     )
     fill(compact, 73)
-    fill(everything, 73)
+    fill(large, 73)
     known = {
-        everything.rewards[step, env].item(): (step, env, everything.next_observations[step, env])
+        large.rewards[step, env].item(): (step, env, large.next_observations[step, env])
         for step in range(73)
         for env in range(N_ENVS)
     }
@@ -78,7 +100,7 @@ def test_once_full_it_holds_the_newest_transitions_and_the_right_next_observatio
             step, env, expected = known[reward.item()]
             seen.add(step)
             np.testing.assert_allclose(after.numpy(), expected, rtol=5e-4)
-            assert done.item() == everything.dones[step, env] * (1 - everything.timeouts[step, env])
+            assert done.item() == large.dones[step, env] * (1 - large.timeouts[step, env])
     assert seen == set(range(53, 73))
     assert len(compact._last_observations) <= 21
 
@@ -86,5 +108,46 @@ def test_once_full_it_holds_the_newest_transitions_and_the_right_next_observatio
 def test_a_million_transitions_fit_into_a_gigabyte():
     buffer = CompactReplayBuffer(1_000_000, *SPACES, device="cpu", n_envs=40)
     arrays = (buffer.observations, buffer.actions, buffer.rewards, buffer.dones, buffer.timeouts)
-    kept_aside = 1_000_000 / Scenario().max_cycles * 363 * 2
-    assert sum(array.nbytes for array in arrays) + kept_aside < 0.8e9
+    last_observations = 1_000_000 / Scenario().max_cycles * 363 * 2
+    assert sum(array.nbytes for array in arrays) + last_observations < 0.8e9
+
+
+def test_transitions_without_an_expert_action_are_refused_in_one_line():
+    buffer = CompactReplayBuffer(80, *SPACES, device="cpu", n_envs=N_ENVS, store_expert_actions=True)
+    with pytest.raises(SettingsError, match="store_expert_actions = True: the infos have no expert_action"):
+        fill(buffer, 1)
+
+
+def test_arguments_of_the_previous_release_warn_and_work():
+    with pytest.warns(RenamedWarning) as warned:
+        buffer = CompactReplayBuffer(80, *SPACES, device="cpu", n_envs=N_ENVS, mirror=True, advice=True)
+    assert [str(warning.message).split(";")[0] for warning in warned] == [
+        "CompactReplayBuffer: mirror is now mirror_augmentation",
+        "CompactReplayBuffer: advice is now store_expert_actions",
+    ]
+    assert buffer.mirror_augmentation
+    assert buffer.expert_actions is not None
+    with pytest.raises(TypeError, match="unexpected argument 'colour'"):
+        CompactReplayBuffer(80, *SPACES, device="cpu", n_envs=N_ENVS, colour="red")
+
+
+@pytest.mark.parametrize("kind", [CompactReplayBuffer, ReplayBuffer])
+@pytest.mark.parametrize("steps", [7, 150])
+def test_a_restored_buffer_gives_equal_samples(kind, steps):
+    buffer, other = (kind(400, *SPACES, device="cpu", n_envs=N_ENVS) for _ in range(2))
+    fill(buffer, steps)
+    load_replay_state(other, replay_state(buffer))
+    for more in range(2):
+        for ours, theirs in zip(samples(buffer), samples(other), strict=True):
+            if ours is not None:
+                th.testing.assert_close(ours, theirs, rtol=0, atol=0)
+        fill(buffer, 5, seed=1 + more)
+        fill(other, 5, seed=1 + more)
+
+
+def test_a_buffer_of_another_shape_is_refused():
+    buffer = CompactReplayBuffer(80, *SPACES, device="cpu", n_envs=N_ENVS)
+    fill(buffer, 3)
+    wider = spaces.Box(0.0, 1.0, (3, 13, 13), np.float32)
+    with pytest.raises(ValueError, match="replay buffer's observations"):
+        load_replay_state(CompactReplayBuffer(80, wider, SPACES[1], device="cpu", n_envs=N_ENVS), replay_state(buffer))

@@ -10,20 +10,27 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
 from sb3_flock import FlockCNN, NeighborInclusiveReward, Scenario, flatten, make_vec_env
-from sb3_flock.rl.callbacks import FlockMetrics, LinearNoiseDecay
+from sb3_flock.rl.callbacks import (
+    DivergedError,
+    FlockMetrics,
+    LinearNoiseDecay,
+    StopOnNonFiniteLoss,
+    StoreExecutedActions,
+)
 from sb3_flock.settings import SettingsError
 
 CROWDED = Scenario(n_vehicles=4, n_obstacles=1, arena=0.2, obstacle_arena=0.4, neighbor_separation=0.02, max_cycles=5)
 
 
 class Record(BaseCallback):
-    """Keeps every step's rewards, infos and dones as the callbacks before it left them."""
+    """Keeps every step's rewards, infos, dones and logged values as the callbacks before it left them."""
 
     def __init__(self):
         super().__init__()
-        self.steps = []
+        self.steps, self.logged = [], []
 
     def _on_step(self):
+        self.logged.append(dict(self.logger.name_to_value))
         self.steps.append((self.locals["rewards"].copy(), self.locals["infos"], self.locals["dones"].copy()))
         return True
 
@@ -76,13 +83,13 @@ def test_neighbors_at_the_end_of_an_episode_are_those_of_its_last_step():
     model = learn(make_vec_env(CROWDED, n_flocks=2, seed=2), [NeighborInclusiveReward(0.5), record], 10, FlockCNN)
     _, infos, dones = record.steps[4]
     assert dones.all()
-    # The neighbor channel of the last observation tells the neighbors, whatever the infos say.
+    # The neighbor channel of the last observation shows whether there are neighbors.
     for info in infos:
         assert (len(info["neighbors"]) > 0) == (info["terminal_observation"][0].max() > 0)
     np.testing.assert_allclose(model.replay_buffer.rewards[4], expected_mix(infos, 4, 0.5), rtol=1e-5)
 
 
-def test_it_works_with_n_step_returns():
+def test_mixed_rewards_with_n_step_returns():
     record = Record()
     model = learn(make_vec_env(CROWDED, n_flocks=1, seed=3), [NeighborInclusiveReward(0.5), record], 5, FlockCNN, n_steps=3)
     mixed = np.array([expected_mix(infos, 4, 0.5) for _, infos, _ in record.steps[:3]])
@@ -109,7 +116,7 @@ def spread_env():
     return NeighborContract(simple_spread_v3.parallel_env(N=3, local_ratio=1.0, max_cycles=8, continuous_actions=True))
 
 
-def test_it_works_on_an_env_that_is_not_ours():
+def test_mixed_rewards_on_an_env_of_another_package():
     record = Record()
     model = learn(flatten(spread_env(), n_copies=2, seed=0), [NeighborInclusiveReward(0.6), record], 20)
     mixed_somewhere = False
@@ -117,11 +124,11 @@ def test_it_works_on_an_env_that_is_not_ours():
         np.testing.assert_allclose(model.replay_buffer.rewards[step], expected_mix(infos, 3, 0.6), rtol=1e-5)
         mixed_somewhere |= not np.allclose(rewards, [info["reward"] for info in infos])
     assert mixed_somewhere
-    # SuperSuit marks no time limit; the flattening does.
+    # SuperSuit marks no time limit; flatten() does.
     assert model.replay_buffer.timeouts[7].all()
 
 
-def test_it_works_on_supersuits_own_wrapper_when_told_the_number_of_agents():
+def test_mixed_rewards_on_supersuits_own_wrapper_with_n_agents_given():
     flat = supersuit.concat_vec_envs_v1(
         supersuit.pettingzoo_env_to_vec_env_v1(spread_env()), 2, base_class="stable_baselines3"
     )
@@ -134,7 +141,7 @@ def test_it_works_on_supersuits_own_wrapper_when_told_the_number_of_agents():
     np.testing.assert_allclose(list(callback._finished)[:6], returns, rtol=1e-5)
 
 
-def test_without_the_key_an_agent_keeps_its_reward():
+def test_an_agent_without_neighbors_in_its_info_keeps_its_reward():
     callback = NeighborInclusiveReward(0.5, n_agents=2)
     np.testing.assert_array_equal(callback.mix(np.array([1.0, 3.0]), [{}, {"neighbors": [0]}]), [1.0, 2.0])
 
@@ -163,7 +170,7 @@ def test_vec_normalize_is_refused():
         learn(env, NeighborInclusiveReward(), 1, FlockCNN)
 
 
-def test_agents_that_cannot_be_counted_are_told():
+def test_a_wrong_or_missing_number_of_agents_is_refused():
     env = make_vec_env(CROWDED, n_flocks=1, seed=1)
     for wrong in (3, 2):
         with pytest.raises(SettingsError, match=f"n_agents = {wrong}.*which is 4"):
@@ -174,15 +181,54 @@ def test_agents_that_cannot_be_counted_are_told():
 
 
 @pytest.mark.parametrize("lambda_", [-0.1, 1.1, float("nan")])
-def test_a_share_outside_0_1_is_refused(lambda_):
+def test_a_lambda_outside_0_1_is_refused(lambda_):
     with pytest.raises(SettingsError, match="lambda_"):
         NeighborInclusiveReward(lambda_)
 
 
-def test_noise_fades_linearly():
+def test_noise_decays_linearly():
     env = make_vec_env(CROWDED, n_flocks=1, seed=1)
     model = learn(
         env, LinearNoiseDecay(0.4, 0.2), 10, FlockCNN, action_noise=NormalActionNoise(np.zeros(2), np.full(2, 9.0))
     )
     # Ten vector steps; the last round starts with one tenth of the way left.
     np.testing.assert_allclose(model.action_noise.noises[3]._sigma, 0.22)
+
+
+class ExpertDrivesVehicle1(BaseCallback):
+    """Marks one vehicle's steps as an expert's, as an ExpertEnv does."""
+
+    action = np.array([0.15, 1.0])
+
+    def _on_step(self):
+        info = self.locals["infos"][1]
+        info["expert_drives"], info["executed_action"] = True, self.action
+        info["metrics"] = dict.fromkeys(info["metrics"], 1e9)
+        return True
+
+
+def test_executed_actions_are_stored_where_an_expert_drove():
+    env = make_vec_env(CROWDED, n_flocks=1, seed=1)
+    model = learn(env, [ExpertDrivesVehicle1(), StoreExecutedActions()], 10, FlockCNN)
+    stored = model.replay_buffer.actions[:10]
+    np.testing.assert_allclose(stored[:, 1], np.tile([1.0, 1 / np.pi], (10, 1)), rtol=1e-5)
+    assert len(np.unique(stored[:, [0, 2, 3], 0])) == 30  # the others' actions are their own
+
+
+def test_flock_metrics_are_means_without_the_experts_steps():
+    env, record = make_vec_env(CROWDED, n_flocks=1, seed=1), Record()
+    learn(env, [ExpertDrivesVehicle1(), FlockMetrics(), record], 5, FlockCNN)
+    errors = [info["metrics"]["tracking_error"] for _, infos, _ in record.steps for info in (infos[0], *infos[2:])]
+    assert record.logged[-1]["flock/tracking_error"] == pytest.approx(np.mean(errors))
+
+
+@pytest.mark.parametrize("name", ["train/actor_loss", "train/bc_loss"])
+def test_a_loss_that_is_not_finite_stops_the_training(name):
+    class Diverge(BaseCallback):
+        def _on_step(self):
+            self.logger.record(name, float("nan") if self.num_timesteps >= 12 else 1.0)
+            return True
+
+    env = make_vec_env(CROWDED, n_flocks=1, seed=1)
+    with pytest.raises(DivergedError, match=f"{name} = nan after 12 transitions: the training diverged"):
+        learn(env, [StopOnNonFiniteLoss(), Diverge()], 10, FlockCNN)

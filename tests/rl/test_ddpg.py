@@ -35,51 +35,55 @@ def model(algorithm, extractor, fused, **kwargs):
 
 
 @pytest.mark.parametrize("n_critics", [1, 2])
-def test_fifty_updates_end_where_stock_ddpg_with_plain_convolutions_ends(n_critics):
-    lean, stock = (
+def test_fifty_updates_equal_those_of_sb3s_ddpg_with_torchs_convolutions_up_to_rounding(n_critics):
+    ours, sb3 = (
         model(FlockDDPG, FlockCNN, True, n_critics=n_critics),
         model(DDPG, PlainCNN, False, n_critics=n_critics),
     )
-    start = [parameter.clone() for parameter in lean.policy.parameters()]
-    for one in (lean, stock):
+    start = [parameter.clone() for parameter in ours.policy.parameters()]
+    for one in (ours, sb3):
         one.learn(600)
         np.random.seed(1)  # noqa: NPY002 - what SB3 draws from
         one.train(50, 64)
-    assert lean._n_updates == stock._n_updates == 50
-    for parameter, first in zip(lean.policy.parameters(), start, strict=True):
+    assert ours._n_updates == sb3._n_updates == 50
+    for parameter, first in zip(ours.policy.parameters(), start, strict=True):
         assert not th.equal(parameter, first)
-    for (name, ours), (same, theirs) in zip(lean.policy.named_parameters(), stock.policy.named_parameters(), strict=True):
+    for (name, value), (same, expected) in zip(ours.policy.named_parameters(), sb3.policy.named_parameters(), strict=True):
         assert name == same
-        th.testing.assert_close(ours, theirs, rtol=1e-3, atol=1e-5, msg=lambda text, name=name: f"{name}: {text}")
+        th.testing.assert_close(value, expected, rtol=1e-3, atol=1e-5, msg=lambda text, name=name: f"{name}: {text}")
     for name in ("train/actor_loss", "train/critic_loss"):
-        assert lean.logger.name_to_value[name] == pytest.approx(stock.logger.name_to_value[name], rel=1e-3)
+        assert ours.logger.name_to_value[name] == pytest.approx(sb3.logger.name_to_value[name], rel=1e-3)
 
 
 @pytest.mark.parametrize("bc_coef", [0.0, 30.0])
-def test_guidance_draws_the_actor_to_what_is_advised(bc_coef):
-    lean, rng = model(FlockDDPG, FlockCNN, True), np.random.default_rng(0)
-    lean.bc_coef, advised = bc_coef, np.array([0.5, -0.25])
-    envs, shape = lean.n_envs, lean.observation_space.shape
-    lean.replay_buffer = CompactReplayBuffer(1200, lean.observation_space, lean.action_space, "cpu", envs, advice=True)
+def test_behavior_cloning_moves_the_actor_to_the_experts_actions(bc_coef):
+    ddpg, rng = model(FlockDDPG, FlockCNN, True), np.random.default_rng(0)
+    ddpg.bc_coef, expert_action = bc_coef, np.array([0.5, -0.25])
+    envs, shape = ddpg.n_envs, ddpg.observation_space.shape
+    ddpg.replay_buffer = CompactReplayBuffer(
+        1200, ddpg.observation_space, ddpg.action_space, "cpu", envs, store_expert_actions=True
+    )
     for _ in range(100):
-        tensors, actions = rng.random((2, envs, *shape)), rng.uniform(-1, 1, (envs, 2))
-        infos = [{"advice": lean.policy.unscale_action(advised)}] * envs
-        lean.replay_buffer.add(*tensors, actions, rng.normal(size=envs), np.zeros(envs, bool), infos)
-    lean._update_current_progress_remaining(0, 1)
-    lean.train(200, 64)
-    observations = lean.replay_buffer.sample(200).observations
-    actions = lean.actor(observations).detach().numpy()
-    gap = np.square(actions - advised).mean()
+        observations, actions = rng.random((2, envs, *shape)), rng.uniform(-1, 1, (envs, 2))
+        infos = [{"expert_action": ddpg.policy.unscale_action(expert_action)}] * envs
+        ddpg.replay_buffer.add(*observations, actions, rng.normal(size=envs), np.zeros(envs, bool), infos)
+    ddpg._update_current_progress_remaining(0, 1)
+    ddpg.train(200, 64)
+    observations = ddpg.replay_buffer.sample(200).observations
+    actions = ddpg.actor(observations).detach().numpy()
+    gap = np.square(actions - expert_action).mean()
     if bc_coef:
         assert gap < 0.01
-        assert lean.logger.name_to_value["train/bc_loss"] < 0.1
+        assert ddpg.logger.name_to_value["train/bc_loss"] < 0.1
     else:
         assert gap > 0.1
-        assert "train/bc_loss" not in lean.logger.name_to_value
+        assert "train/bc_loss" not in ddpg.logger.name_to_value
 
 
-def test_guidance_without_advice_is_refused_in_one_line():
-    with pytest.raises(SettingsError, match="bc_coef = 2.0: needs a CompactReplayBuffer with advice=True, or be 0"):
+def test_bc_coef_without_expert_actions_is_refused_in_one_line():
+    with pytest.raises(
+        SettingsError, match="bc_coef = 2.0: a CompactReplayBuffer with store_expert_actions=True is needed, or bc_coef 0"
+    ):
         FlockDDPG(FlockPolicy, make_vec_env(n_flocks=1), bc_coef=2.0, device="cpu")
 
 
@@ -88,3 +92,12 @@ def test_another_extractor_is_refused_in_one_line():
         FlockDDPG(
             FlockPolicy, make_vec_env(n_flocks=1), policy_kwargs={"features_extractor_class": FlattenExtractor}, device="cpu"
         )
+
+
+def test_the_learning_rate_follows_its_schedule():
+    ddpg = model(FlockDDPG, FlockCNN, True)
+    ddpg.learn(600)
+    ddpg.lr_schedule = lambda remaining: 2e-3 * remaining
+    ddpg._current_progress_remaining = 0.25
+    ddpg.train(1, 64)
+    assert [group["lr"] for network in (ddpg.actor, ddpg.critic) for group in network.optimizer.param_groups] == [5e-4] * 2

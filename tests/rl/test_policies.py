@@ -6,6 +6,8 @@ from torch import nn
 from sb3_flock import FlockCNN, FlockPolicy, FlockSACPolicy
 from sb3_flock.envs.flocking_v0 import action_space, observation_space
 from sb3_flock.rl.policies import InvertingBound
+from sb3_flock.rl.registry import flock_policy_kwargs
+from sb3_flock.rl.settings import NetworkConfig
 from sb3_flock.sim import Scenario
 
 SCENARIO = Scenario()
@@ -22,7 +24,7 @@ def sizes(network):
     return [(m.in_features, m.out_features) for m in network.modules() if isinstance(m, nn.Linear)]
 
 
-def test_the_critic_has_a_hidden_layer_for_the_action_that_joins_before_the_last_hidden_layer():
+def test_the_critics_action_layer_joins_before_the_last_hidden_layer():
     policy = build(n_critics=1, action_layer=16, net_arch=[64])
     assert sizes(policy.critic.action_layers[0]) == [(2, 16)]
     assert sizes(policy.critic.qf0) == [(128 + 16, 64), (64, 1)]
@@ -31,7 +33,7 @@ def test_the_critic_has_a_hidden_layer_for_the_action_that_joins_before_the_last
     assert policy.critic.features_extractor is not policy.actor.features_extractor
 
 
-def test_the_gradient_in_the_action_sees_the_state():
+def test_the_gradient_in_the_action_depends_on_the_state():
     critic = build(n_critics=1, final_init=None).critic
     actions = ACTIONS[:1].expand(6, 2).clone().requires_grad_()  # one action in six states
     critic.q1_forward(OBSERVATIONS * 3, actions).sum().backward()
@@ -46,7 +48,7 @@ def test_q1_is_the_first_networks_value_and_critics_differ():
     assert first.shape == (6, 1)
 
 
-def test_all_of_the_critic_learns_and_each_network_by_its_own_value():
+def test_a_critic_networks_value_has_gradients_in_its_own_layers_and_the_extractor():
     critic = build(n_critics=2, final_init=None).critic
     critic(OBSERVATIONS, ACTIONS)[1].sum().backward()
     touched = {name for name, p in critic.named_parameters() if p.grad is not None and p.grad.abs().sum() > 0}
@@ -62,20 +64,22 @@ def test_every_parameter_of_the_critic_is_optimized():
     assert optimized == {id(p) for p in critic.parameters()}
 
 
-def test_small_output_layers_start_in_the_middle_of_the_action_range():
+def test_small_output_layers_give_the_middle_of_the_action_range_at_the_start():
+    plain = build(final_init=3e-3, features_extractor_kwargs={"layer_norm": False})
+    np.testing.assert_allclose(plain.predict(OBSERVATIONS.numpy(), deterministic=True)[0], [[0.075, 0.0]] * 6, atol=0.01)
     actions, _ = build(final_init=3e-3).predict(OBSERVATIONS.numpy(), deterministic=True)
-    np.testing.assert_allclose(actions, [[0.075, 0.0]] * 6, atol=0.01)
+    np.testing.assert_allclose(actions / [0.15, 2 * np.pi], [[0.5, 0.0]] * 6, atol=0.005)
     assert max(p.abs().max() for p in build(final_init=3e-3).actor.mu[-2].parameters()) <= 3e-3
 
 
-def test_actions_end_in_the_papers_bound_and_bias():
+def test_actions_stay_in_the_action_space_however_large_the_outputs():
     actions, _ = build(final_init=50.0).predict((OBSERVATIONS * 9).numpy(), deterministic=True)
     assert actions.min(0)[0] >= 0
     assert actions.max(0)[0] <= np.float32(0.15)
     assert np.abs(actions[:, 1]).max() <= np.float32(np.pi)
 
 
-def test_the_bound_clamps_and_an_outward_gradient_stops_there_and_turns_around_beyond():
+def test_the_inverting_bound_clamps_and_inverts_outward_gradients_beyond_it():
     raw = th.tensor([-3.0, -1.0, 0.0, 0.5, 1.0, 3.0], requires_grad=True)
     bounded = InvertingBound()(raw)
     assert bounded.tolist() == [-1.0, -1.0, 0.0, 0.5, 1.0, 1.0]
@@ -86,7 +90,7 @@ def test_the_bound_clamps_and_an_outward_gradient_stops_there_and_turns_around_b
 
 
 @pytest.mark.parametrize(("action_bound", "leaves"), [("inverting", True), ("tanh", False)])
-def test_an_actor_stuck_beyond_its_bound_comes_back_unless_it_is_a_tanh(action_bound, leaves):
+def test_an_actor_far_beyond_its_bound_recovers_with_inverting_gradients_but_not_with_a_tanh(action_bound, leaves):
     actor = build(action_bound=action_bound).actor
     th.nn.init.constant_(actor.mu[-2].bias, -20.0)
     optimizer = th.optim.SGD([actor.mu[-2].bias], lr=1.0)
@@ -108,3 +112,17 @@ def test_policies_save_and_load(policy_class, tmp_path):
     second, _ = loaded.predict(OBSERVATIONS.numpy(), deterministic=True)
     np.testing.assert_array_equal(first, second)
     th.testing.assert_close(policy.critic(OBSERVATIONS, ACTIONS)[1], loaded.critic(OBSERVATIONS, ACTIONS)[1])
+
+
+def test_the_policy_by_itself_has_the_settings_that_learn():
+    policy, defaults = build(), NetworkConfig()
+    assert policy.action_bound == "inverting"
+    assert isinstance(policy.actor.mu[-1], InvertingBound)
+    assert sizes(policy.actor.mu) == [(defaults.features_dim, *defaults.net_arch), (*defaults.net_arch, 2)]
+    for network in (policy.actor, policy.critic, build(FlockSACPolicy).actor):
+        assert [type(module) for module in network.features_extractor.dense] == [nn.Linear, nn.LayerNorm, nn.ReLU]
+    # All but SB3's default number of critics and the optimizer's kind is what a config's networks have.
+    built = build(**{**flock_policy_kwargs(defaults.replace(n_critics=2)), "optimizer_kwargs": {}})
+    for (name, value), (same, expected) in zip(policy.state_dict().items(), built.state_dict().items(), strict=True):
+        assert name == same
+        th.testing.assert_close(value, expected, rtol=0, atol=0)

@@ -12,7 +12,7 @@ def space(side=11, channels=3):
 
 
 @pytest.mark.parametrize(
-    ("side", "kwargs"), [(11, {}), (7, {"stride": 1}), (21, {"channels": (4, 8)}), (11, {"layer_norm": True})]
+    ("side", "kwargs"), [(11, {}), (7, {"stride": 1}), (21, {"channels": (4, 8)}), (11, {"layer_norm": False})]
 )
 def test_features_have_the_stated_shape(side, kwargs):
     extractor = FlockCNN(space(side), features_dim=24, **kwargs)
@@ -20,18 +20,19 @@ def test_features_have_the_stated_shape(side, kwargs):
     assert extractor.features_dim == 24
 
 
-def test_two_convolutions_and_one_dense_layer_each_behind_a_relu():
+def test_by_default_two_convolutions_and_one_dense_layer_with_layer_norm():
     extractor = FlockCNN(space())
     kinds = [type(module).__name__ for module in extractor.modules() if not list(module.children())]
-    assert kinds == ["Conv2d", "ReLU", "Conv2d", "ReLU", "_FlattenByAnchor", "Linear", "ReLU"]
+    assert kinds == ["Conv2d", "ReLU", "Conv2d", "ReLU", "_FlattenByAnchor", "Linear", "LayerNorm", "ReLU"]
+    assert not any(isinstance(module, th.nn.LayerNorm) for module in FlockCNN(space(), layer_norm=False).modules())
 
 
 @pytest.mark.parametrize(
     ("side", "kwargs"),
     [(11, {}), (7, {"stride": 1}), (12, {"channels": (4, 6, 5), "kernel_size": 2}), (9, {"channels": (4,)})],
 )
-def test_it_computes_what_torchs_own_layers_do_forward_and_backward(side, kwargs):
-    extractor = FlockCNN(space(side), features_dim=24, layer_norm=True, **kwargs)
+def test_forward_and_backward_equal_torchs_own_layers(side, kwargs):
+    extractor = FlockCNN(space(side), features_dim=24, **kwargs)
     observations = th.randn(5, 3, side, side, requires_grad=True)
     ours, torchs = extractor(observations), extractor.dense(extractor.cnn(observations))
     th.testing.assert_close(ours, torchs)
@@ -42,21 +43,21 @@ def test_it_computes_what_torchs_own_layers_do_forward_and_backward(side, kwargs
         assert one.stride() == other.contiguous().stride()
 
 
-def test_every_anchor_matters():
+def test_every_anchor_has_a_gradient():
     extractor = FlockCNN(space())
     observation = th.rand(1, 3, 11, 11, requires_grad=True)
     extractor(observation).sum().backward()
     assert (observation.grad != 0).all()
 
 
-def test_a_tensor_too_small_or_of_another_kind_is_told_clearly():
-    with pytest.raises(ValueError, match="do not fit a tensor of"):
+def test_an_observation_too_small_or_of_another_kind_is_refused():
+    with pytest.raises(ValueError, match="do not fit an observation of"):
         FlockCNN(space(3))
     with pytest.raises(ValueError, match="channels, l, l"):
         FlockCNN(spaces.Box(0.0, 1.0, (5,), np.float32))
 
 
-def test_it_serves_in_plain_sb3():
+def test_the_extractor_in_plain_sb3():
     env = make_vec_env(n_flocks=1, seed=0)
     model = DDPG("MlpPolicy", env, policy_kwargs={"features_extractor_class": FlockCNN}, buffer_size=10, device="cpu")
     assert isinstance(model.actor.features_extractor, FlockCNN)

@@ -1,4 +1,4 @@
-"""Policies of strangers: flown or refused in one line, never run; and those of plain SB3."""
+"""Policies from untrusted files: loaded or refused in one line, no code of theirs is run; and files of plain SB3."""
 
 import base64
 import io
@@ -31,7 +31,7 @@ def rewrite(path, changes):
     return copy
 
 
-def test_a_run_folder_means_its_best_model_else_its_final(saved, tmp_path):
+def test_a_run_folder_means_its_best_model_else_its_final_one(saved, tmp_path):
     run = tmp_path / "run"
     run.mkdir()
     with pytest.raises(PolicyError, match=r"no best_model"):
@@ -43,7 +43,7 @@ def test_a_run_folder_means_its_best_model_else_its_final(saved, tmp_path):
 
 
 def broken_files(saved):
-    """Files that are no policy, with the words that tell why."""
+    """Files that are no policy, with words of the error."""
     whole = saved.read_bytes()
     with zipfile.ZipFile(saved) as archive:
         member = json.loads(archive.read("flock.json"))
@@ -70,7 +70,7 @@ def broken_files(saved):
         yield rewrite(saved, changes), words
 
 
-def test_files_that_are_no_policy_are_told_in_one_line(saved):
+def test_files_that_are_no_policy_are_refused_in_one_line(saved):
     for path, words in broken_files(saved):
         with pytest.raises(PolicyError, match=words) as error:
             load_policy(path)
@@ -127,18 +127,18 @@ def hostile_files(saved, mark):
 
 def test_no_code_in_a_file_is_ever_run(saved, tmp_path):
     mark = tmp_path / "owned"
-    flown = 0
+    loaded = 0
     for file in hostile_files(saved, mark):
         try:
             load_policy(file)
-            flown += 1
+            loaded += 1
         except PolicyError as error:
             assert "\n" not in str(error)  # noqa: PT017 - either is fine
         assert not mark.exists()
-    assert flown >= 5  # what flying does not need is not even read
+    assert loaded >= 5  # members that inference does not need are not read
 
 
-def test_the_hostile_files_are_hostile_and_trust_means_trust(saved, tmp_path):
+def test_the_hostile_files_run_their_code_with_trust(saved, tmp_path):
     mark = tmp_path / "owned"
     first = next(hostile_files(saved, mark))
     with pytest.raises(PolicyError, match="SB3 cannot load it either"):  # the code left no policy class
@@ -146,7 +146,7 @@ def test_the_hostile_files_are_hostile_and_trust_means_trust(saved, tmp_path):
     assert mark.exists()
 
 
-def test_trust_loads_what_sb3_loads(model, saved):
+def test_with_trust_sb3_loads_the_file(model, saved):
     observations = np.random.default_rng(0).random((4, 3, 11, 11)).astype(np.float32)
     trusted = load_policy(saved, trust=True)
     assert trusted.config == SMALL_MODEL
@@ -230,7 +230,7 @@ assert megabytes < 200, megabytes
     assert [line.split(":")[0] for line in lines] == files
 
 
-def test_names_that_point_outside_write_nothing(saved, tmp_path):
+def test_members_with_names_outside_the_folder_are_not_written(saved, tmp_path):
     with zipfile.ZipFile(saved, "a") as archive:
         archive.writestr("../outside", "x")
         archive.writestr("/tmp/../outside", "x")
@@ -238,7 +238,7 @@ def test_names_that_point_outside_write_nothing(saved, tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {"policy.zip"}
 
 
-def test_what_an_error_quotes_from_a_file_cannot_talk_to_the_terminal(model, saved):
+def test_an_error_quotes_a_file_without_control_characters(model, saved):
     state = {**model.policy.state_dict(), "actor.\x1b[2J": th.zeros(1)}
     with pytest.raises(PolicyError) as error:
         load_policy(rewrite(saved, {"policy.pth": tensors(state)}))
@@ -250,19 +250,19 @@ def test_what_an_error_quotes_from_a_file_cannot_talk_to_the_terminal(model, sav
     ("policy", "kwargs"),
     [
         (FlockPolicy, {}),
-        (FlockPolicy, {"action_bound": "tanh", "net_arch": [32, 16], "features_extractor_kwargs": {"layer_norm": True}}),
+        (FlockPolicy, {"action_bound": "tanh", "net_arch": [32, 16], "features_extractor_kwargs": {"layer_norm": False}}),
         (
             "MlpPolicy",
             {"features_extractor_class": FlockCNN, "net_arch": [24], "features_extractor_kwargs": {"features_dim": 8}},
         ),
     ],
 )
-def test_files_of_plain_sb3_with_our_parts_fly_without_trust(tmp_path, algorithm, policy, kwargs):
+def test_files_of_plain_sb3_with_our_parts_load_without_trust(tmp_path, algorithm, policy, kwargs):
     plain = algorithm(policy, make_vec_env(SMALL_MODEL.scenario, seed=0), policy_kwargs=kwargs, buffer_size=10, seed=0)
     for parameter in plain.policy.parameters():
-        parameter.data.mul_(3)  # out of the small start, so that the bounds count
+        parameter.data.mul_(3)  # away from the small initial values, so that the bounds matter
     plain.save(tmp_path / "plain.zip")
-    with pytest.warns(UserWarning, match="taken to be the default"):
+    with pytest.warns(UserWarning, match="the default is assumed"):
         loaded, trusted = (load_policy(tmp_path / "plain.zip", trust=trust) for trust in (False, True))
     observations = np.random.default_rng(0).random((50, 3, 11, 11)).astype(np.float32)
     expected = plain.predict(observations, deterministic=True)[0]
@@ -271,11 +271,11 @@ def test_files_of_plain_sb3_with_our_parts_fly_without_trust(tmp_path, algorithm
 
 
 @pytest.mark.parametrize("trust", [False, True])
-def test_a_second_look_in_a_file_of_plain_sb3_is_taken_to_be_ours(tmp_path, trust):
+def test_motion_channels_in_a_file_of_plain_sb3_are_assumed_to_be_those_of_our_configs(tmp_path, trust):
     scenario = SMALL_MODEL.scenario.replace(motion_lag=0.2)
     plain = DDPG(FlockPolicy, make_vec_env(scenario, seed=0), buffer_size=10, seed=0)
     plain.save(tmp_path / "plain.zip")
-    with pytest.warns(UserWarning, match="taken to be the default"):
+    with pytest.warns(UserWarning, match="the default is assumed"):
         loaded = load_policy(tmp_path / "plain.zip", trust=trust)
     assert loaded.scenario.motion_lag == 0.2
     assert evaluate(loaded, episodes=1)["return"].n == 1
@@ -287,6 +287,6 @@ def test_files_of_plain_sb3_with_other_parts_need_trust(tmp_path):
     with pytest.raises(PolicyError, match="trust"):
         load_policy(tmp_path / "plain.zip")
     observations = np.random.default_rng(0).random((4, 3, 11, 11)).astype(np.float32)
-    with pytest.warns(UserWarning, match="taken to be the default"):
+    with pytest.warns(UserWarning, match="the default is assumed"):
         trusted = load_policy(tmp_path / "plain.zip", trust=True)
     np.testing.assert_array_equal(trusted.predict(observations)[0], plain.predict(observations, deterministic=True)[0])

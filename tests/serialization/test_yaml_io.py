@@ -1,7 +1,9 @@
 import pytest
 import yaml
 
+from sb3_flock._renamed import RenamedWarning
 from sb3_flock.config.training import TrainingConfig
+from sb3_flock.serialization.migrate import FORMAT
 from sb3_flock.serialization.yaml_io import load_config, parse_overrides, to_yaml
 from sb3_flock.settings import SettingsError, leaf_paths
 
@@ -42,9 +44,11 @@ def test_overrides_are_yaml_and_1e_3_is_a_number():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("scenario:\n  n_vehicels: 3\n", r"scenario.n_vehicels is not a parameter; did you mean n_vehicles\?"),
+        ("scenario:\n  n_vehicels: 3\n", r"scenario.n_vehicels is not a parameter; did you mean scenario.n_vehicles\?"),
+        ("gama: 0.9\n", r"gama is not a parameter; did you mean algorithm.gamma\?, in its group"),
+        ("algorithm:\n  lr: 0.1\n", r"algorithm.lr is not a parameter; did you mean algorithm.learning_rate\?"),
         ("scenario: 3\n", "scenario = 3: a mapping"),
-        ("learner:\n  gamma: 1.5\n", "gamma = 1.5"),
+        ("algorithm:\n  gamma: 1.5\n", "gamma = 1.5"),
         ("[1, 2]", "a mapping of parameters"),
         ("a: [", "not a YAML file"),
         ("!!python/object/apply:os.system ['true']", "not a YAML file"),
@@ -53,7 +57,7 @@ def test_overrides_are_yaml_and_1e_3_is_a_number():
         ("scenario: &a\n  reward: *a\n", "reward"),
         ("network:\n  net_arch: [-1]\n", "net_arch"),
         ("seed: 4294967296\n", "seed = 4294967296"),
-        ("practice:\n  separation_scale: 0.5\n", "separation_scale = 0.5"),
+        ("train_env:\n  separation_scale: 0.5\n", "separation_scale = 0.5"),
     ],
 )
 def test_a_wrong_file_is_one_line(tmp_path, text, message):
@@ -69,38 +73,28 @@ def test_a_missing_file_is_one_line(tmp_path):
 
 @pytest.mark.parametrize("assignment", ["gamma", "=3", "gamma=[", "gamma=2021-13-45"])
 def test_a_wrong_override_is_one_line(assignment):
-    with pytest.raises(SettingsError, match="--set"):
+    with pytest.raises(SettingsError, match="KEY=VALUE is needed|the value is not YAML"):
         parse_overrides([assignment])
-
-
-def test_practice_flies_its_own_number_of_vehicles_or_the_tasks():
-    for vehicles, flown in ((3, [3]), ([9], [9]), (None, [5]), ([3, 20], [3, 20])):
-        config = load_config(TrainingConfig, overrides={"n_vehicles": 5, "train_env.flock_sizes": vehicles})
-        assert [scenario.n_vehicles for scenario in config.training_scenarios()] == flown
-        assert config.scenario.n_vehicles == 5
-
-
-def test_practice_is_harder_than_the_task_and_scales_with_it():
-    overrides = {"n_obstacles": 1, "obstacle_arena": 40.0, "neighbor_separation": 2.0, "link_range": 2.04}
-    overrides |= {"obstacle_separation": 3.0, "detection_range": 5.0}
-    config = load_config(TrainingConfig, overrides={**overrides, "extra_obstacles": 3, "separation_scale": 1.1})
-    flown = config.training_scenarios()[0]
-    assert (flown.n_obstacles, flown.obstacle_arena, flown.neighbor_separation) == (4, 20.0, 2.04)
-    assert flown.obstacle_separation == pytest.approx(3.3)
-    apart = config.replace(train_env=config.train_env.replace(obstacle_separation_scale=1.5)).training_scenarios()[0]
-    assert (apart.neighbor_separation, apart.obstacle_separation) == (2.04, 4.5)
-    assert config.scenario.n_obstacles == 1
-    none = load_config(TrainingConfig, overrides={"n_obstacles": 0, "extra_obstacles": 3})
-    assert none.training_scenarios()[0].n_obstacles == 0
-
-
-def test_practice_takes_longer_steps_for_the_same_time():
-    config = load_config(TrainingConfig, overrides={"max_cycles": 200, "time_step": 0.1, "time_step_scale": 2.5})
-    flown = config.training_scenarios()[0]
-    assert (flown.max_cycles, flown.time_step) == (80, 0.25)
-    shortest = load_config(TrainingConfig, overrides={"max_cycles": 1, "time_step_scale": 10})
-    assert shortest.training_scenarios()[0].max_cycles == 1
 
 
 def test_yaml_is_plain():
     assert yaml.safe_load(to_yaml(TrainingConfig()))["network"]["channels"] == [16, 32]
+
+
+def test_the_format_is_written_and_not_taken_for_a_parameter(tmp_path):
+    text = to_yaml(TrainingConfig())
+    assert text.startswith(f"format: {FORMAT} # ")
+    assert load_config(TrainingConfig, write(tmp_path, text)) == TrainingConfig()
+    assert load_config(TrainingConfig, write(tmp_path, "seed: 3\n")).seed == 3  # without one: the present format
+
+
+def test_another_config_is_a_base_whose_values_stay():
+    base = TrainingConfig(seed=7, algorithm={"gamma": 0.9})
+    config = load_config(TrainingConfig, overrides={"tau": 0.1}, base=base)
+    assert (config.seed, config.algorithm.gamma, config.algorithm.tau) == (7, 0.9, 0.1)
+
+
+def test_an_override_by_an_old_name_warns_and_works():
+    with pytest.warns(RenamedWarning, match="update_ratio is now algorithm.utd_ratio"):
+        config = load_config(TrainingConfig, overrides={"update_ratio": 0.7})
+    assert config.algorithm.utd_ratio == 0.7

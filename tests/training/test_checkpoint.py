@@ -1,6 +1,5 @@
 import csv
 import functools
-import signal
 
 import numpy as np
 import pytest
@@ -12,7 +11,6 @@ from sb3_flock.serialization.load import PolicyError, checkpoint_paths
 from sb3_flock.serialization.yaml_io import load_config, to_yaml
 from sb3_flock.settings import SettingsError
 from sb3_flock.training.checkpoint import LoadedCheckpoint, reproducibility_warnings
-from sb3_flock.training.signals import GracefulShutdown
 from sb3_flock.training.train import resume, train
 from tests.helpers import quiet, tiny, training_state
 
@@ -51,14 +49,14 @@ LONG = {"scenario.max_cycles": 40, "save_freq": 120, "eval_freq": 180, "total_ti
         ("ddpg", {"expert": "olfati-saber", "expert_fraction": 0.9, "train_env.flock_sizes": [1, 2]}),
     ],
 )
-def test_a_resumed_run_ends_like_one_never_interrupted_to_the_last_bit(tmp_path, algo, changes):
+def test_a_resumed_run_equals_an_uninterrupted_one_to_the_last_bit(tmp_path, algo, changes):
     one = train(tiny(tmp_path / "a", algo=algo, **{**LONG, **changes}), quiet())
     config = tiny(tmp_path / "b", algo=algo, **{**LONG, **changes})
     folder = tmp_path / "b" / "runs" / one.folder.name
     for steps in (200, 460):
-        go_on = functools.partial(resume, folder) if folder.exists() else functools.partial(train, config)
+        proceed = functools.partial(resume, folder) if folder.exists() else functools.partial(train, config)
         with pytest.raises(PowerError):
-            go_on(quiet(), callbacks=[PowerFails(steps)])
+            proceed(quiet(), callbacks=[PowerFails(steps)])
         np.random.seed(steps)  # noqa: NPY002 - another process would have other streams
         th.manual_seed(steps)
     other = resume(folder, quiet())
@@ -69,7 +67,7 @@ def test_a_resumed_run_ends_like_one_never_interrupted_to_the_last_bit(tmp_path,
         np.testing.assert_array_equal(value, theirs[name], err_msg=name)
 
 
-def test_a_complete_run_goes_on_only_with_more_transitions(tmp_path):
+def test_a_complete_run_continues_only_with_more_transitions(tmp_path):
     first = train(tiny(tmp_path), quiet())
     for changes in (None, {"total_timesteps": 100}, {"total_timesteps": 300}):
         with pytest.raises(SettingsError, match="a larger total_timesteps"):
@@ -92,13 +90,13 @@ def test_a_complete_run_goes_on_only_with_more_transitions(tmp_path):
     assert {120, 300, 420} <= set(steps)
 
 
-def test_other_surroundings_are_told(tmp_path):
+def test_another_runtime_is_reported(tmp_path):
     first = train(tiny(tmp_path), quiet())
     checkpoint = LoadedCheckpoint(checkpoint_paths(first.folder)[-1], 10**9)
     assert reproducibility_warnings(checkpoint, first.config) == ""
     checkpoint.state["runtime_info"]["torch"] = "1.0"
     assert "; not bit-exact: torch 1.0 then, " in reproducibility_warnings(checkpoint, first.config)
-    assert "workers start new episodes" in reproducibility_warnings(checkpoint, first.config.replace(num_cpus=2))
+    assert "worker processes start new episodes" in reproducibility_warnings(checkpoint, first.config.replace(num_cpus=2))
 
 
 def test_a_checkpoint_of_another_config_is_refused(tmp_path):
@@ -107,18 +105,3 @@ def test_a_checkpoint_of_another_config_is_refused(tmp_path):
     (first.folder / "config.yaml").write_text(to_yaml(wider))
     with pytest.raises(PolicyError, match="not a checkpoint of this run's config"):
         resume(first.folder, quiet())
-
-
-def test_a_signal_that_comes_too_late_to_save_is_not_lost():
-    handler = signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job inherits an ignored one
-    waited_for = []
-
-    def work():
-        with GracefulShutdown().waiting() as signals:
-            signal.raise_signal(signal.SIGINT)
-            waited_for.append(signals.caught)
-
-    with pytest.raises(KeyboardInterrupt):
-        work()
-    assert waited_for == [signal.SIGINT]
-    assert signal.signal(signal.SIGINT, handler) is signal.default_int_handler

@@ -64,7 +64,7 @@ class Run:
         )
 
     def position(self):
-        """Transitions flown so far."""
+        """Transitions so far."""
         try:
             return int(self.position_file.read_text() or 0)
         except FileNotFoundError:
@@ -133,11 +133,11 @@ def survive(kills, total, tmp_path, start):
             time.sleep(moments.uniform(0, 1.5))
         run.process.kill()
         run.process.wait()
-        flown = run.position()
-        assert flown < total
+        done = run.position()
+        assert done < total
         whole = [LoadedCheckpoint(checkpoint, 10**9) for checkpoint in checkpoint_paths(folder)]
         assert len(whole) <= config.keep_checkpoints + 1  # killed between a new one and the removal of the oldest
-        assert whole[-1].num_timesteps > flown - config.save_freq - 2 * 6  # an interval, and the step under way
+        assert whole[-1].num_timesteps > done - config.save_freq - 2 * 6  # an interval, and the step under way
     code, _, errors = start("--resume", folder).end(seconds=250)
     assert code == 0, errors
     alone = train(config.replace(output_dir=str(tmp_path / "alone")), quiet())
@@ -152,7 +152,7 @@ def survive(kills, total, tmp_path, start):
         np.testing.assert_array_equal(value, theirs[name], err_msg=name)
 
 
-def test_a_killed_run_goes_on_and_ends_as_if_never_killed(tmp_path, start):
+def test_a_killed_run_resumes_and_ends_as_if_never_killed(tmp_path, start):
     survive(2, 3000, tmp_path, start)
 
 
@@ -163,7 +163,7 @@ def test_twenty_kills(tmp_path, start):
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_saves_first_and_prints_how_to_go_on(tmp_path, start, number, code):
+def test_a_signal_saves_first_and_prints_how_to_resume(tmp_path, start, number, code):
     _, path = config_file(tmp_path, save_freq=0)
     run = start("--config", path)
     run.wait_for(200)
@@ -172,7 +172,7 @@ def test_a_signal_saves_first_and_prints_how_to_go_on(tmp_path, start, number, c
     folder = tmp_path / "runs" / "ddpg_3v1o_1"
     steps = newest(folder).num_timesteps
     assert steps == run.position()  # nothing is lost
-    assert f"rl_model_{steps}_steps.zip is saved; to go on: sb3-flock train --resume {folder}" in errors
+    assert f"rl_model_{steps}_steps.zip is saved; resume {folder} to continue" in errors
     assert load_policy(folder).path.name in {"best_model.zip", f"rl_model_{steps}_steps.zip"}
     if number == signal.SIGINT:
         code, _, errors = start("--resume", folder, "--total-timesteps", steps + 60).end()
@@ -190,7 +190,7 @@ def test_a_full_disk_is_one_line_and_leaves_what_was_saved(tmp_path, start):
     assert "File too large" in last
     folder = tmp_path / "runs" / "ddpg_3v1o_1"
     whole = newest(folder)
-    assert f"{whole.path.name} is saved; to go on: sb3-flock train --resume {folder}" in last
+    assert f"{whole.path.name} is saved; resume {folder} to continue" in last
     assert not list(folder.glob("*.tmp")) + list(folder.glob(".*.tmp"))
     code, _, _ = start("--resume", folder, "--total-timesteps", whole.num_timesteps + 60).end()
     assert code == 0
@@ -223,7 +223,7 @@ def test_a_folder_that_turns_read_only_is_one_line_and_leaves_what_was_saved(tmp
     whole = newest(folder)
     last = errors.strip().splitlines()[-1]
     assert "Permission denied" in last
-    assert f"{whole.path.name} is saved; to go on: sb3-flock train --resume {folder}" in last
+    assert f"{whole.path.name} is saved; resume {folder} to continue" in last
     code, _, errors = start("--resume", folder, limit=obey_permissions).end()
     assert code == 1
     assert "Permission denied" in errors.strip().splitlines()[-1]
@@ -254,7 +254,7 @@ def test_no_process_outlives_a_killed_one(tmp_path, start, victim):
     if victim == "worker":
         code, _, errors = start("--resume", folder, "--total-timesteps", steps + 60).end()
         assert code == 0
-        assert "not bit-exact: workers start new episodes" in errors
+        assert "not bit-exact: worker processes start new episodes" in errors
 
 
 def children(pid):
@@ -277,7 +277,7 @@ def test_a_diverged_training_is_one_line_and_is_not_saved(tmp_path, start):
 
 
 @pytest.mark.parametrize("damage", ["truncated", "flipped", "empty"])
-def test_a_damaged_newest_checkpoint_is_passed_over(tmp_path, damage):
+def test_a_damaged_newest_checkpoint_is_skipped(tmp_path, damage):
     result = train(tiny(tmp_path, total_timesteps=600, save_freq=150), quiet())
     older, last = checkpoint_paths(result.folder)
     whole = last.read_bytes()
@@ -292,9 +292,9 @@ def test_a_damaged_newest_checkpoint_is_passed_over(tmp_path, damage):
     steps = LoadedCheckpoint(older, 10**9).num_timesteps
     console = Console(file=io.StringIO(), width=200)
     resume(result.folder, console)
-    told = console.file.getvalue()
-    assert f"passed over {last}: damaged or not a checkpoint" in told
-    assert f"resumes {result.folder} after {steps} of 600 transitions" in told
+    printed = console.file.getvalue()
+    assert f"skipped {last}: damaged or not a checkpoint" in printed
+    assert f"resumes {result.folder} after {steps} of 600 transitions" in printed
     assert last.read_bytes() != whole[:middle]
     assert newest(result.folder).num_timesteps == 600
 

@@ -1,4 +1,4 @@
-"""A short training that fails if learning is broken anywhere between the env and the weights."""
+"""A short training that fails if anything between the env and the weights is broken."""
 
 import io
 
