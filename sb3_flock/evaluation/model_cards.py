@@ -1,4 +1,4 @@
-"""Model cards: the record of a shipped policy, as JSON beside its zip."""
+"""Model cards: how a shipped policy was trained and how it performs, as JSON beside its zip."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from sb3_flock.serialization.load import load_policy
 from sb3_flock.serialization.migrate import MEMBER
 
 CHECK_EPISODES, CHECK_SEED = 50, 7
-"""The short evaluation whose tracking error a card records: a later version checks that the policy behaves as before."""
+"""The short evaluation whose tracking error a card records. The tests repeat it with every later version."""
 
 
 def read_card(name: str) -> dict[str, Any]:
-    """The card of a shipped policy: how its trainings were run, their learning curves and their results."""
+    """The card of a shipped policy: the commands, the learning curves and the results of its trainings."""
     card: dict[str, Any] = json.loads(shipped_policies()[name].with_suffix(".json").read_text(encoding="utf-8"))
     return card
 
@@ -36,11 +36,13 @@ def median_of_seeds(card: dict[str, Any]) -> dict[str, float]:
 
 
 def ship(name: str, runs: Sequence[str | Path], folder: str | Path, episodes: int = 1000) -> Path:
-    """Write ``<name>.zip`` and ``<name>.json`` from trainings that differ in their seed: the best policy, and all results.
+    """Write the best policy as ``<name>.zip`` and the results of all trainings as ``<name>.json``.
 
-    The best is chosen by the evaluations during training; the results are on separate episodes.
+    The evaluations during training choose the best policy; the results are from separate episodes.
 
-    :param runs: run folders of finished trainings
+    :param runs: run folders of finished trainings that differ in their seed
+    :param folder: existing folder to write to
+    :param episodes: number of episodes of each result
     :return: the path of the zip
     """
     folder, records, best = Path(folder), [], (np.inf, Path())
@@ -78,9 +80,9 @@ def ship(name: str, runs: Sequence[str | Path], folder: str | Path, episodes: in
 
 
 def _copy_light(source: Path, target: Path) -> None:
-    """Copy a policy at a quarter of its size: half precision, and the target networks as copies of the networks they follow.
+    """Copy a policy at a quarter of its size: in half precision, with the networks' weights in place of their targets'.
 
-    The config's ``output_dir`` is reset: it names a folder of the training machine.
+    The config's ``output_dir`` is reset, because it names a folder of the training machine.
     """
     with zipfile.ZipFile(source) as archive, zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as copy:
         for name in archive.namelist():
