@@ -259,9 +259,10 @@ def _sensors(policy: LoadedPolicy, episodes: int) -> str:
 
 
 def densest_tracking(n_vehicles: int, separation: float = 0.1) -> float:
-    """The least mean distance to a waypoint of vehicles that keep a separation [m], nearly: nearest points of a triangular lattice.
+    """About the least mean distance to a waypoint of vehicles that keep a separation [m].
 
-    The lattice is centered on one point, between two or among three, whichever is best; other packings may be slightly better.
+    The vehicles are the nearest points of a triangular lattice, which is centered on one point, between two or among three,
+    whichever is best. Other packings may be slightly better.
 
     :param separation: smallest distance between two vehicles [m]
     """
@@ -294,8 +295,8 @@ def _training_time(folder: Path, steps: int) -> str:
         )
     note = (
         "The paper reports 122, 140 and 147 ms an episode for (3, 1), (5, 1) and (5, 2), and not its episodes' length or its "
-        "rate of updates. The observation does not grow with the number of vehicles. Acting and storing take time for each vehicle, "
-        "and so do updates that are counted for each transition."
+        "rate of updates. The observation does not grow with the number of vehicles. Acting and storing take time for each "
+        "vehicle, and so do updates that are counted for each transition."
     )
     return "\n".join([*lines, "", "![time against vehicles](training_time.png)", "", note])
 

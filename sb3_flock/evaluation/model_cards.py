@@ -5,12 +5,13 @@ from __future__ import annotations
 import io
 import json
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch as th
+from numpy.typing import NDArray
 
 from sb3_flock.config.training import TrainingConfig
 from sb3_flock.evaluation.rollout import evaluate
@@ -47,19 +48,8 @@ def ship(name: str, runs: Sequence[str | Path], folder: str | Path, episodes: in
     """
     folder, records, best = Path(folder), [], (np.inf, Path())
     for run in map(Path, runs):
-        policy = load_policy(run)
         history = np.load(run / "evaluations.npz")
-        metrics = evaluate(policy, episodes=episodes, seed=0)
-        records.append(
-            {
-                "seed": policy.config.seed,
-                "command": (run / "command.txt").read_text(encoding="utf-8").strip(),
-                "transitions": int(history["timesteps"][-1]),
-                "minutes": round(float(history["seconds"][-1]) / 60, 1),
-                "metrics": {key: None if metric.mean is None else round(metric.mean, 5) for key, metric in metrics.items()},
-                "curve": {key: history[key].round(4).tolist() for key in ("timesteps", "return", "tracking_error")},
-            }
-        )
+        records.append(_record(run, history, episodes))
         best = min(best, (float(history["score"].min()), run))
     _copy_light(load_policy(best[1]).path, folder / f"{name}.zip")
     shipped = load_policy(folder / f"{name}.zip")
@@ -77,6 +67,20 @@ def ship(name: str, runs: Sequence[str | Path], folder: str | Path, episodes: in
     }
     (folder / f"{name}.json").write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
     return folder / f"{name}.zip"
+
+
+def _record(run: Path, history: Mapping[str, NDArray[np.float64]], episodes: int) -> dict[str, Any]:
+    """The record of one training: its command, its length, its learning curve and its results."""
+    policy = load_policy(run)
+    metrics = evaluate(policy, episodes=episodes, seed=0)
+    return {
+        "seed": policy.config.seed,
+        "command": (run / "command.txt").read_text(encoding="utf-8").strip(),
+        "transitions": int(history["timesteps"][-1]),
+        "minutes": round(float(history["seconds"][-1]) / 60, 1),
+        "metrics": {key: None if metric.mean is None else round(metric.mean, 5) for key, metric in metrics.items()},
+        "curve": {key: history[key].round(4).tolist() for key in ("timesteps", "return", "tracking_error")},
+    }
 
 
 def _copy_light(source: Path, target: Path) -> None:
