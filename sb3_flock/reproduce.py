@@ -296,7 +296,7 @@ def _training_time(folder: Path, steps: int) -> str:
     note = (
         "The paper reports 122, 140 and 147 ms an episode for (3, 1), (5, 1) and (5, 2), and not its episodes' length or its "
         "rate of updates. The observation does not grow with the number of vehicles. Acting and storing take time for each "
-        "vehicle, and so do updates that are counted for each transition."
+        "vehicle, and so do updates where their number follows the transitions."
     )
     return "\n".join([*lines, "", "![time against vehicles](training_time.png)", "", note])
 

@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sb3_flock._compat import find_ray_cluster, ray_trials
-from sb3_flock.config.training import TrainingConfig
+from sb3_flock._renamed import rename_key
 from sb3_flock.evaluation.metrics import METRICS
 from sb3_flock.serialization.yaml_io import to_yaml
-from sb3_flock.settings import RunError, SettingsError, resolve_path
+from sb3_flock.settings import RunError, SettingsError
 from sb3_flock.sweep.config import SweepConfig, is_integer, load_sweep
 
 if TYPE_CHECKING:
@@ -291,7 +291,7 @@ def _ended(trial: Any, folder: Folder) -> Trial:
     saved = trial.checkpoint
     return Trial(
         name=str(trial),
-        point={".".join(resolve_path(TrainingConfig, key)): value for key, value in trial.config.items()},
+        point={rename_key(key): value for key, value in trial.config.items()},
         status="failed" if failed else report.get("status", "unfinished"),
         why=_first_cause(trial) if failed else report.get("why", ""),
         metrics={name: float(test[name]) for name in (*METRICS, "score") if name in test},

@@ -1,17 +1,20 @@
 """Whole sweeps by the command line: on one machine, on a cluster of two nodes, with kills."""
 
 import csv
+import io
 import os
 import signal
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import pytest
 import torch as th
 
 from sb3_flock import load_policy, train
 from sb3_flock.sweep.config import load_sweep
+from sb3_flock.sweep.run import Folder, _as_csv, _ended
 from tests.helpers import TINY, quiet
 
 pytest.importorskip("ray")
@@ -190,7 +193,8 @@ def test_a_policy_over_a_grid_has_the_metrics_of_evaluate(tmp_path):
         (["--evaluate", "nobody"], "nobody: no such file or run folder"),
         (
             ["--evaluate", "general", "--set", "n_anchors=7"],
-            "general.zip: it sees tensors of (6, 11, 11), but the scenario's (n_anchors = 7, motion_lag = 0.2) are of (6, 7, 7)",
+            "general.zip: its observations have the shape (6, 11, 11), the scenario's (n_anchors = 7, motion_lag = 0.2) have "
+            "(6, 7, 7)",
         ),
         (["--evaluate", "general", "--set", "gamma=0.5"], "algorithm.gamma does not affect an evaluation"),
         (["--episodes", "3"], "--episodes 3: only with --evaluate"),
@@ -206,6 +210,19 @@ def test_a_mistake_is_one_line_and_leaves_no_file(words, message, tmp_path, monk
     assert message in errors
     assert errors.count("\n") == 1
     assert [path.name for path in tmp_path.iterdir()] == ["mine.yaml"]
+
+
+def test_a_trial_of_the_previous_release_has_todays_names(tmp_path):
+    """Ray's state keeps each trial's point under the names of its release; the grid of the sweep has today's."""
+    config = load_sweep("", text="grid: {train_env.flock_sizes: [[3]], algorithm.action_noise_std: [0.2]}")
+    report = {"status": "done", "timesteps": 300, "test": {"tracking_error": 0.1}}
+    kept = SimpleNamespace(
+        config={"practice.vehicles": [3], "learner.noise": 0.2}, last_result=report, status="TERMINATED", checkpoint=None
+    )
+    trial = _ended(kept, Folder(str(tmp_path)))
+    assert set(trial.point) == set(config.grid)
+    (row,) = csv.DictReader(io.StringIO(_as_csv(config, [trial])))
+    assert (row["train_env.flock_sizes"], row["algorithm.action_noise_std"], row["tracking_error"]) == ("[3]", "0.2", "0.1")
 
 
 def test_more_resources_than_the_machine_has_are_refused(tmp_path):
