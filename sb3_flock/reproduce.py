@@ -1,9 +1,10 @@
-"""The paper's tables and figures, ours beside theirs, in one folder (``sb3-flock reproduce``)."""
+"""The paper's tables and figures beside the results of this package, in one folder."""
 
 from __future__ import annotations
 
 import json
 import time
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from sb3_flock.config.training import TrainingConfig
 from sb3_flock.controllers import CONTROLLERS, make_controller
 from sb3_flock.envs.vec_env import make_vec_env
 from sb3_flock.evaluation import robustness
-from sb3_flock.evaluation.metrics import Metric, columns
+from sb3_flock.evaluation.metrics import METRICS, Metric, columns
 from sb3_flock.evaluation.model_cards import median_of_seeds, read_card
 from sb3_flock.evaluation.report import PAPER
 from sb3_flock.evaluation.robustness import evaluate_with_errors
@@ -34,22 +35,22 @@ SETTINGS = {
     "ddpg-5v1o": Scenario(n_vehicles=5, n_obstacles=1),
     "ddpg-5v2o": Scenario(n_vehicles=5, n_obstacles=2),
 }
-"""The paper's experiments by the shipped policy's name."""
+"""The paper's experiments by the name of their shipped `ddpg` policy."""
 
-OURS = {"ours": "ddpg-", "ours, with a second look": "ddpg-bc-"}
-"""Our rows, and how the names of their policies begin."""
+KINDS = {"ddpg (the paper's observation)": "ddpg-", "ddpg-bc (motion channels, expert)": "ddpg-bc-"}
+"""The kinds of shipped policies by the label of their rows, with the first part of their names."""
 
 CROSSING = "crossing-5v2o"
 """The policy trained for obstacles that cross the flock."""
 
-TRAINED = "ours, trained for it"
-"""Its rows."""
+TRAINED = "ddpg-bc, trained for crossing obstacles"
+"""The label of its row."""
 
-FLEETS = (1, 2, 3, 5, 8, 12, 20, 50, 200)
-"""Vehicles that the general policy is flown with."""
+FLOCK_SIZES = (1, 2, 3, 5, 8, 12, 20, 50, 200)
+"""Numbers of vehicles with which the policy `general` is evaluated."""
 
 _MOST_IN_THE_ARENA = 50
-"""Vehicles that start in the paper's arena and leave room for obstacles."""
+"""Number of vehicles that start in the paper's arena and leave room for obstacles."""
 
 COLUMNS = {
     "tracking error": "tracking_error",
@@ -57,18 +58,19 @@ COLUMNS = {
     "... in encounters": "encounter_min_separation_obstacles",
     "min. sep. neighbors": "min_separation_neighbors",
     "mean separation": "mean_separation",
-    "too close to a neighbor": "neighbor_violation_rate",
-    "... to an obstacle": "obstacle_violation_rate",
+    "neighbor violations": "neighbor_violation_rate",
+    "obstacle violations": "obstacle_violation_rate",
     "connected": "connectivity",
 }
+"""The metrics of the tables by their headings."""
 
 
 @dataclass(frozen=True)
 class Size:
-    """How much is flown and measured."""
+    """Numbers of episodes, and of vector steps for the timing."""
 
     episodes: int
-    fleet_episodes: int
+    flock_size_episodes: int
     timed_steps: int
 
 
@@ -76,10 +78,10 @@ FULL, QUICK = Size(1000, 200, 100), Size(100, 20, 20)
 
 
 def reproduce(out: str | Path, quick: bool = False, console: Console | None = None) -> Path:
-    """Fly the shipped policies and the hand-written controllers; write every table and figure of the paper with ours.
+    """Evaluate the shipped policies and the baseline controllers; write every table and figure of the paper beside them.
 
     :param out: folder for ``results.md``, ``tables.json`` and the figures as PNG and SVG
-    :param quick: 100 episodes instead of 1000, and the other measurements shortened alike
+    :param quick: 100 episodes instead of 1000, and shorter measurements of the rest
     :return: the path of ``results.md``
     :raises SettingsError: if matplotlib is missing or the folder cannot be written
     """
@@ -89,28 +91,23 @@ def reproduce(out: str | Path, quick: bool = False, console: Console | None = No
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise SettingsError(f"--out {out}: {error.strerror or error}") from None
+        raise SettingsError(f"out = {out}: {error.strerror or error}") from None
     policies = {name: load_policy(name) for name in shipped_policies()}
-    ours = {name: {label: policies[own] for label, own in _ours(name).items()} for name in SETTINGS}
+    tables: dict[str, dict[str, dict[str, Metric]]] = {}
+    sections: dict[str, Callable[[], str]] = {
+        "tables I and II": lambda: _tables(tables, policies, size.episodes),
+        "crossing obstacles": lambda: _crossing(policies, size.episodes),
+        "figures": lambda: _episode_figures(folder, policies["ddpg-5v2o"]),
+        "training curves": lambda: _training_curve(folder),
+        "one policy with 1 to 200 vehicles": lambda: _flock_sizes(folder, policies["general"], size.flock_size_episodes),
+        "sensor errors": lambda: _sensors(policies["ddpg-5v2o"], size.episodes // 4 or 1),
+        "time of training against the number of vehicles": lambda: _training_time(folder, size.timed_steps),
+    }
     parts = [_head(size)]
     with console.status("") as status:
-        tables: dict[str, Any] = {}
-        for name, scenario in SETTINGS.items():
-            status.update(f"{scenario.bodies}: {size.episodes} episodes of each controller")
-            tables[name] = _fly_all(ours[name], scenario, size.episodes)
-        parts.append(_tables(tables))
-        status.update("a hard test: crossing obstacles")
-        trained = policies[CROSSING]
-        parts.append(_crossing(_fly_all({TRAINED: trained, **ours["ddpg-5v2o"]}, trained.scenario, size.episodes)))
-        status.update("figures")
-        parts.append(_flight_figures(folder, policies["ddpg-5v2o"]))
-        parts.append(_training_curve(folder))
-        status.update("one policy with 1 to 200 vehicles")
-        parts.append(_fleets(folder, policies["general"], size.fleet_episodes))
-        status.update("sensors that err")
-        parts.append(_sensors(policies["ddpg-5v2o"], size.episodes // 4 or 1))
-        status.update("time of training against the number of vehicles")
-        parts.append(_training_time(folder, size.timed_steps))
+        for title, section in sections.items():
+            status.update(title)
+            parts.append(section())
     (folder / "results.md").write_text("\n\n".join(parts) + "\n", encoding="utf-8")
     (folder / "tables.json").write_text(json.dumps(tables, indent=1, default=vars) + "\n", encoding="utf-8")
     return folder / "results.md"
@@ -119,22 +116,22 @@ def reproduce(out: str | Path, quick: bool = False, console: Console | None = No
 def _head(size: Size) -> str:
     packages = ", ".join(f"{name} {number}" for name, number in versions().items())
     return (
-        "# The paper's tables and figures, ours beside theirs\n\n"
-        f"{size.episodes} episodes a row (seed 0), distances in meters, settled values as `docs/choices.md` defines them. "
-        f"Made by `sb3-flock reproduce` with {packages}."
+        "# The paper's tables and figures beside the results of this package\n\n"
+        f"{size.episodes} episodes a row (seed 0), distances in meters, steady-state values as `docs/paper_deviations.md` "
+        f"defines them. Made by `sb3-flock reproduce` with {packages}."
     )
 
 
-def _ours(name: str) -> dict[str, str]:
-    """The names of our policies for an experiment of :data:`SETTINGS`, by label."""
-    return {label: name.replace("ddpg-", kind) for label, kind in OURS.items()}
+def _policies_for(name: str) -> dict[str, str]:
+    """The names of the shipped policies for an experiment of :data:`SETTINGS`, by label."""
+    return {label: name.replace("ddpg-", kind) for label, kind in KINDS.items()}
 
 
-def _fly_all(ours: dict[str, LoadedPolicy], scenario: Scenario, episodes: int) -> dict[str, dict[str, Metric]]:
-    """The metrics of the policies, by label, and of every hand-written controller that is installed."""
+def _evaluate_all(policies: Mapping[str, LoadedPolicy], scenario: Scenario, episodes: int) -> dict[str, dict[str, Metric]]:
+    """The metrics of the policies, by label, and of every baseline controller that is installed."""
     rows = {
         label: evaluate(policy, scenario.replace(motion_lag=policy.scenario.motion_lag), episodes, seed=0)
-        for label, policy in ours.items()
+        for label, policy in policies.items()
     }
     for name in CONTROLLERS:
         try:
@@ -145,123 +142,129 @@ def _fly_all(ours: dict[str, LoadedPolicy], scenario: Scenario, episodes: int) -
     return rows
 
 
-def _tables(tables: dict[str, dict[str, dict[str, Metric]]]) -> str:
-    """Tables I and II with our rows and the peers'."""
+def _tables(tables: dict[str, Any], policies: Mapping[str, LoadedPolicy], episodes: int) -> str:
+    """Tables I and II with the rows of this package; the metrics go into ``tables``."""
     parts = ["## Tables I and II"]
-    for name, rows in tables.items():
-        scenario = SETTINGS[name]
-        policies = " and ".join(f"`{own}`" for own in _ours(name).values())
-        lines_ = [f"{scenario.bodies} ({policies}):\n", *_header()]
+    for name, scenario in SETTINGS.items():
+        shipped = _policies_for(name)
+        tables[name] = _evaluate_all({label: policies[own] for label, own in shipped.items()}, scenario, episodes)
+        names = " and ".join(f"`{own}`" for own in shipped.values())
+        lines = [f"{scenario.bodies} ({names}):\n", *_header()]
         for table, figures in PAPER[scenario.n_vehicles, scenario.n_obstacles].items():
-            lines_.append(_row(f"paper, {table}", figures))
-        for label, own in _ours(name).items():
+            lines.append(_row(f"paper, {table}", figures))
+        for label, own in shipped.items():
             card = read_card(own)
-            lines_.append(_row(f"{label}, median of {len(card['seeds'])} trainings, on record", median_of_seeds(card)))
-        lines_ += _rows(rows)
-        parts.append("\n".join(lines_))
+            lines.append(
+                _row(f"{label}, median of {len(card['seeds'])} trainings, from the model card", median_of_seeds(card))
+            )
+        parts.append("\n".join([*lines, *_rows(tables[name])]))
     return "\n\n".join(parts)
 
 
-def _crossing(rows: dict[str, dict[str, Metric]]) -> str:
-    lines_ = [
+def _crossing(policies: Mapping[str, LoadedPolicy], episodes: int) -> str:
+    others = _policies_for("ddpg-5v2o")
+    labeled = {TRAINED: policies[CROSSING], **{label: policies[name] for label, name in others.items()}}
+    lines = [
         "## A hard test: obstacles that cross the flock\n",
-        "5 vehicles, 2 obstacles, `--scenario crossing` "
-        f"(`{CROSSING}` is trained for it, `ddpg-5v2o` and `ddpg-bc-5v2o` are not):\n",
+        f"5 vehicles, 2 obstacles, `--obstacle-motion crossing` (`{CROSSING}` is trained for crossing obstacles, "
+        f"{' and '.join(f'`{name}`' for name in others.values())} are not):\n",
+        *_header(),
     ]
-    return "\n".join([*lines_, *_header(), *_rows(rows)])
+    return "\n".join([*lines, *_rows(_evaluate_all(labeled, policies[CROSSING].scenario, episodes))])
 
 
-def _rows(rows: dict[str, dict[str, Metric]]) -> list[str]:
-    shown = {label: f"{label}, the shipped one, flown now" for label in (*OURS, TRAINED)}
-    return [
-        _row(shown.get(name, f"`{name}`"), {metric: values.mean for metric, values in metrics.items()})
-        for name, metrics in rows.items()
-    ]
+def _rows(rows: Mapping[str, Mapping[str, Metric]]) -> list[str]:
+    labels = {label: f"{label}, the shipped policy" for label in (*KINDS, TRAINED)}
+    return [_row(labels.get(name, f"`{name}`"), _means(metrics)) for name, metrics in rows.items()]
+
+
+def _means(metrics: Mapping[str, Metric]) -> dict[str, float | None]:
+    return {name: metric.mean for name, metric in metrics.items()}
 
 
 def _header() -> list[str]:
     return ["| | " + " | ".join(COLUMNS) + " |", "|---" * (len(COLUMNS) + 1) + "|"]
 
 
-def _row(label: str, values: dict[str, Any]) -> str:
+def _row(label: str, values: Mapping[str, float | None]) -> str:
     cells = []
-    for metric in COLUMNS.values():
-        value = values.get(metric)
-        is_rate = metric.endswith("rate") or metric == "connectivity"
-        cells.append("" if value is None else f"{100 * value:.2f} %" if is_rate else f"{value:.3f}")
+    for name in COLUMNS.values():
+        value = values.get(name)
+        cells.append("" if value is None else f"{100 * value:.2f} %" if METRICS[name].is_rate else f"{value:.3f}")
     return f"| {label} | " + " | ".join(cells) + " |"
 
 
-def _flight_figures(folder: Path, policy: LoadedPolicy) -> str:
+def _episode_figures(folder: Path, policy: LoadedPolicy) -> str:
     save(plot_trajectories(record_trajectory(policy, policy.scenario, seed=0, episode=1)), folder / "trajectories")
     save(plot_observation(policy.scenario), folder / "observation")
     return (
-        "## One flight, and what a vehicle sees\n\n![paths of one episode](trajectories.png)\n\n"
+        "## One episode, and what a vehicle observes\n\n![paths of one episode](trajectories.png)\n\n"
         "![ten neighbors and the channel that shows them](observation.png)"
     )
 
 
 def _training_curve(folder: Path) -> str:
-    """The return of the evaluations during the trainings on record, by flock episodes practiced."""
+    """The return of the evaluations during the trainings of the model cards, against flock episodes of the training env."""
     series = {}
     for name, scenario in SETTINGS.items():
         seeds = read_card(name)["seeds"]
-        steps = load_policy(name).config.training_scenarios()[0]
-        episodes = np.array(seeds[0]["curve"]["timesteps"]) / (steps.n_vehicles * steps.max_cycles)
+        flock = load_policy(name).config.training_scenarios()[0]
+        episodes = np.array(seeds[0]["curve"]["timesteps"]) / (flock.n_vehicles * flock.max_cycles)
         returns = np.array([seed["curve"]["return"] for seed in seeds])
         series[scenario.bodies] = (episodes, returns)
-    save(plot_lines(series, "episodes of a flock practiced", "return of a vehicle, 100 episodes"), folder / "training")
+    save(plot_lines(series, "flock episodes in training", "return of a vehicle, 100 episodes"), folder / "training")
     return (
-        "## Training curves\n\n![return against episodes](training.png)\n\nThe line is the median over the trainings, the shade "
-        "all of them. The paper's policy was stable after about 10 000 episodes."
+        "## Training curves\n\n![return against episodes](training.png)\n\nThe line is the median over the trainings, the "
+        "shade covers all of them. The paper's policy was stable after about 10 000 episodes."
     )
 
 
-def _fleets(folder: Path, policy: LoadedPolicy, episodes: int) -> str:
-    """One policy flown by ever more vehicles, untrained for most of their numbers."""
-    rows = []
-    for n in FLEETS:
+def _flock_sizes(folder: Path, policy: LoadedPolicy, episodes: int) -> str:
+    """One policy with more and more vehicles; most of these flock sizes were not in its training."""
+    rows = {}
+    for n in FLOCK_SIZES:
         arena = max(1.0, (n / _MOST_IN_THE_ARENA) ** 0.5)
         cycles = round(policy.scenario.max_cycles * arena)
         scenario = policy.scenario.replace(n_vehicles=n, arena=arena, max_cycles=cycles)
-        rows.append(evaluate(policy, scenario, max(1, episodes // max(1, n // 20)), seed=0))
-    lines_ = [
+        rows[n] = _means(evaluate(policy, scenario, max(1, episodes // max(1, n // 20)), seed=0))
+    series = {
+        "tracking error [m]": [row["tracking_error"] for row in rows.values()],
+        "least possible tracking error [m]": [densest_tracking(n) for n in FLOCK_SIZES],
+        "vehicle-steps with a neighbor violation": [row["neighbor_violation_rate"] or 0.0 for row in rows.values()],
+        "share not connected": [1 - (row["connectivity"] or 0.0) for row in rows.values()],
+    }
+    curves = {label: (FLOCK_SIZES, np.array(values)) for label, values in series.items()}
+    save(plot_lines(curves, "vehicles", "meters or share", log_x=True), folder / "flock_sizes")
+    lines = [
         "## One policy, any number of vehicles\n",
         f"`general`, 2 obstacles; beyond {_MOST_IN_THE_ARENA} vehicles arena and time grow, so that all find a start.\n",
         *_header(),
+        *(_row(f"{n} vehicle{'s' * (n > 1)}", row) for n, row in rows.items()),
+        "\n![metrics against vehicles](flock_sizes.png)",
     ]
-    lines_ += [
-        _row(f"{n} vehicle{'s' * (n > 1)}", {name: metric.mean for name, metric in row.items()})
-        for n, row in zip(FLEETS, rows, strict=True)
-    ]
-    series = {
-        "tracking error [m]": (FLEETS, np.array([row["tracking_error"].mean for row in rows])),
-        "least possible tracking error [m]": (FLEETS, np.array([densest_tracking(n) for n in FLEETS])),
-        "vehicle-steps too close to a neighbor": (
-            FLEETS,
-            np.array([row["neighbor_violation_rate"].mean or 0.0 for row in rows]),
-        ),
-        "share not connected": (FLEETS, np.array([1 - (row["connectivity"].mean or 0.0) for row in rows])),
-    }
-    save(plot_lines(series, "vehicles", "meters or share", log_x=True), folder / "fleets")
-    return "\n".join([*lines_, "\n![metrics against vehicles](fleets.png)"])
+    return "\n".join(lines)
 
 
 def _sensors(policy: LoadedPolicy, episodes: int) -> str:
     rows = evaluate_with_errors(policy, policy.scenario, episodes)
-    lines_ = [
-        "## Sensors that err\n",
-        f"`ddpg-5v2o`, trained with exact ones; {episodes} episodes a row (`sb3-flock evaluate ddpg-5v2o --sensors`):\n",
-        "| sensor errors | " + " | ".join(metric.column for metric in columns().values()) + " |",
-        "|---" * (len(columns()) + 1) + "|",
+    headings = [METRICS[name].column or name for name in columns()]
+    lines = [
+        "## Sensor errors\n",
+        f"`ddpg-5v2o`, trained without errors; {episodes} episodes a row (`sb3-flock evaluate ddpg-5v2o --sensors`):\n",
+        "| sensor errors | " + " | ".join(headings) + " |",
+        "|---" * (len(headings) + 1) + "|",
+        *(f"| {name} | " + " | ".join(robustness.cells(row)) + " |" for name, row in rows.items()),
     ]
-    return "\n".join([*lines_, *(f"| {name} | " + " | ".join(robustness.cells(row)) + " |" for name, row in rows.items())])
+    return "\n".join(lines)
 
 
 def densest_tracking(n_vehicles: int, separation: float = 0.1) -> float:
-    """About the smallest mean distance to a waypoint of vehicles that keep apart [m]: a triangular lattice's nearest points.
+    """About the least mean distance to a waypoint of vehicles that keep a separation [m].
 
-    The lattice is centered on a point, between two or among three, whichever is best; other packings may be a little better.
+    The vehicles are the nearest points of a triangular lattice, which is centered on one point, between two or among three,
+    whichever is best. Other packings may be slightly better.
+
+    :param separation: smallest distance between two vehicles [m]
     """
     i, j = (axis.ravel() for axis in np.meshgrid(*2 * [np.arange(-40, 41)]))
     points = separation * np.stack((i + j / 2, j * np.sqrt(3) / 2), axis=-1)
@@ -271,31 +274,31 @@ def densest_tracking(n_vehicles: int, separation: float = 0.1) -> float:
 
 
 def _training_time(folder: Path, steps: int) -> str:
-    """Seconds a flock step of training against the number of vehicles, at two rates of updates."""
-    fleets = (1, 3, 5, 8, 12)
+    """Time of a flock step in training against the number of vehicles, at two rates of updates."""
+    sizes = (1, 3, 5, 8, 12)
     measured = {
-        "one update a flock step": [_seconds_per_flock_step(n, 1 / n, steps) for n in fleets],
-        "two updates for five transitions (our default)": [_seconds_per_flock_step(n, 0.4, steps) for n in fleets],
+        "one update a flock step": [_seconds_per_flock_step(n, 1 / n, steps) for n in sizes],
+        "two updates for five transitions (the default)": [_seconds_per_flock_step(n, 0.4, steps) for n in sizes],
     }
-    series = {label: (fleets, 1000 * np.array(values)) for label, values in measured.items()}
+    series = {label: (sizes, 1000 * np.array(values)) for label, values in measured.items()}
     save(plot_lines(series, "vehicles", "milliseconds a flock step"), folder / "training_time")
     cycles = Scenario().max_cycles
-    lines_ = [
+    lines = [
         "## Time of training\n",
-        "| vehicles | " + " | ".join(map(str, fleets)) + " |",
-        "|---" * (len(fleets) + 1) + "|",
+        "| vehicles | " + " | ".join(map(str, sizes)) + " |",
+        "|---" * (len(sizes) + 1) + "|",
     ]
     for label, values in measured.items():
-        lines_.append(f"| {label}: ms a flock step | " + " | ".join(f"{1000 * value:.1f}" for value in values) + " |")
-        lines_.append(
+        lines.append(f"| {label}: ms a flock step | " + " | ".join(f"{1000 * value:.1f}" for value in values) + " |")
+        lines.append(
             f"| ms an episode of {cycles} steps | " + " | ".join(f"{1000 * cycles * value:.0f}" for value in values) + " |"
         )
     note = (
         "The paper reports 122, 140 and 147 ms an episode for (3, 1), (5, 1) and (5, 2), and not its episodes' length or its "
-        "rate of updates. The tensor does not grow with the number of vehicles; acting and storing do, and so do the updates "
-        "where they are counted for each transition."
+        "rate of updates. The observation does not grow with the number of vehicles. Acting and storing take time for each "
+        "vehicle, and so do updates where their number follows the transitions."
     )
-    return "\n".join([*lines_, "", "![time against vehicles](training_time.png)", "", note])
+    return "\n".join([*lines, "", "![time against vehicles](training_time.png)", "", note])
 
 
 def _seconds_per_flock_step(n_vehicles: int, utd_ratio: float, steps: int) -> float:
@@ -306,10 +309,10 @@ def _seconds_per_flock_step(n_vehicles: int, utd_ratio: float, steps: int) -> fl
     env = make_vec_env(config.scenario, config.n_flocks, seed=0)
     try:
         model = build_model(config, env)
-        mixing = NeighborInclusiveReward(config.scenario.reward.lambda_)
-        model.learn(10 * env.num_envs + config.algorithm.batch_size, mixing)
+        mix = NeighborInclusiveReward(config.scenario.reward.lambda_)
+        model.learn(10 * env.num_envs + config.algorithm.batch_size, mix)
         start = time.perf_counter()
-        model.learn(steps * env.num_envs, mixing, reset_num_timesteps=False)
+        model.learn(steps * env.num_envs, mix, reset_num_timesteps=False)
         return (time.perf_counter() - start) / (steps * config.n_flocks)
     finally:
         env.close()

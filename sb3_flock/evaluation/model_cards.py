@@ -1,16 +1,17 @@
-"""Model cards: the record of a shipped policy, as JSON beside its zip."""
+"""Model cards: how a shipped policy was trained and how it performs, as JSON beside its zip."""
 
 from __future__ import annotations
 
 import io
 import json
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch as th
+from numpy.typing import NDArray
 
 from sb3_flock.config.training import TrainingConfig
 from sb3_flock.evaluation.rollout import evaluate
@@ -19,11 +20,11 @@ from sb3_flock.serialization.load import load_policy
 from sb3_flock.serialization.migrate import MEMBER
 
 CHECK_EPISODES, CHECK_SEED = 50, 7
-"""The short evaluation whose tracking error a card records: a later version checks that the policy behaves as before."""
+"""The short evaluation whose tracking error a card records. The tests repeat it with every later version."""
 
 
 def read_card(name: str) -> dict[str, Any]:
-    """The card of a shipped policy: how its trainings were run, their learning curves and their results."""
+    """The card of a shipped policy: the commands, the learning curves and the results of its trainings."""
     card: dict[str, Any] = json.loads(shipped_policies()[name].with_suffix(".json").read_text(encoding="utf-8"))
     return card
 
@@ -36,28 +37,19 @@ def median_of_seeds(card: dict[str, Any]) -> dict[str, float]:
 
 
 def ship(name: str, runs: Sequence[str | Path], folder: str | Path, episodes: int = 1000) -> Path:
-    """Write ``<name>.zip`` and ``<name>.json`` from trainings that differ in their seed: the best policy, and all results.
+    """Write the best policy as ``<name>.zip`` and the results of all trainings as ``<name>.json``.
 
-    The best is chosen by the evaluations during training; the results are on separate episodes.
+    The evaluations during training choose the best policy; the results are from separate episodes.
 
-    :param runs: run folders of finished trainings
+    :param runs: run folders of finished trainings that differ in their seed
+    :param folder: existing folder to write to
+    :param episodes: number of episodes of each result
     :return: the path of the zip
     """
     folder, records, best = Path(folder), [], (np.inf, Path())
     for run in map(Path, runs):
-        policy = load_policy(run)
         history = np.load(run / "evaluations.npz")
-        metrics = evaluate(policy, episodes=episodes, seed=0)
-        records.append(
-            {
-                "seed": policy.config.seed,
-                "command": (run / "command.txt").read_text(encoding="utf-8").strip(),
-                "transitions": int(history["timesteps"][-1]),
-                "minutes": round(float(history["seconds"][-1]) / 60, 1),
-                "metrics": {key: None if metric.mean is None else round(metric.mean, 5) for key, metric in metrics.items()},
-                "curve": {key: history[key].round(4).tolist() for key in ("timesteps", "return", "tracking_error")},
-            }
-        )
+        records.append(_record(run, history, episodes))
         best = min(best, (float(history["score"].min()), run))
     _copy_light(load_policy(best[1]).path, folder / f"{name}.zip")
     shipped = load_policy(folder / f"{name}.zip")
@@ -77,10 +69,24 @@ def ship(name: str, runs: Sequence[str | Path], folder: str | Path, episodes: in
     return folder / f"{name}.zip"
 
 
-def _copy_light(source: Path, target: Path) -> None:
-    """Copy a policy at a quarter of its size: half precision, and the target networks as copies of the networks they follow.
+def _record(run: Path, history: Mapping[str, NDArray[np.float64]], episodes: int) -> dict[str, Any]:
+    """The record of one training: its command, its length, its learning curve and its results."""
+    policy = load_policy(run)
+    metrics = evaluate(policy, episodes=episodes, seed=0)
+    return {
+        "seed": policy.config.seed,
+        "command": (run / "command.txt").read_text(encoding="utf-8").strip(),
+        "transitions": int(history["timesteps"][-1]),
+        "minutes": round(float(history["seconds"][-1]) / 60, 1),
+        "metrics": {key: None if metric.mean is None else round(metric.mean, 5) for key, metric in metrics.items()},
+        "curve": {key: history[key].round(4).tolist() for key in ("timesteps", "return", "tracking_error")},
+    }
 
-    The config's ``output_dir`` is reset: it names a folder of the training machine.
+
+def _copy_light(source: Path, target: Path) -> None:
+    """Copy a policy at a quarter of its size: in half precision, with the networks' weights in place of their targets'.
+
+    The config's ``output_dir`` is reset, because it names a folder of the training machine.
     """
     with zipfile.ZipFile(source) as archive, zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as copy:
         for name in archive.namelist():

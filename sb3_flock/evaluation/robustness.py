@@ -14,7 +14,7 @@ from sb3_flock.sim.sensors import SensorErrors
 
 
 def sensor_errors(scenario: Scenario) -> dict[str, SensorErrors]:
-    """Sensor errors by name, from none to large: noise in fractions of the link range, delay in steps."""
+    """Sensor errors by name, from none to large; noise is a fraction of the link range, delay a number of steps."""
     noise = [round(scenario.link_range * share, 12) for share in (1 / 30, 1 / 15, 2 / 15, 4 / 15)]
     delays = [round(scenario.time_step * steps, 12) for steps in (1, 2, 4, 8)]
     return {

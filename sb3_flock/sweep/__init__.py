@@ -1,1 +1,1 @@
-"""Many trainings or flights at once, on one machine or a Ray cluster, and what they say together."""
+"""Many trainings or evaluations at once, on one machine or a Ray cluster, and the statistics over them."""

@@ -1,4 +1,4 @@
-"""SweepConfig: what a sweep varies, over which training config, with which resources."""
+"""SweepConfig: the fields that a sweep varies, the training config that they are fields of, and the resources."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ from typing import Any
 
 from pydantic import Field, model_validator
 
+from sb3_flock._renamed import rename_key
 from sb3_flock.config.training import TrainingConfig
 from sb3_flock.evaluation.metrics import METRICS
+from sb3_flock.serialization.migrate import FORMAT, check_format
 from sb3_flock.serialization.yaml_io import load_config, read_yaml
 from sb3_flock.settings import Settings, SettingsError, field_of, format_value, resolve_path
 from sb3_flock.sim import Scenario
@@ -22,7 +24,7 @@ _GIVEN = ("output_dir", "torch_threads")
 
 
 class Range(Settings):
-    """Numbers from ``low`` to ``high``; whole ones if the field's are."""
+    """Numbers from ``low`` to ``high``; integers if the field holds integers."""
 
     low: float = Field(description="smallest value")
     high: float = Field(description="largest value")
@@ -36,21 +38,21 @@ class Range(Settings):
 
 
 class Resources(Settings):
-    """What one trial takes of a machine."""
+    """The resources of one trial."""
 
     cpus: int = Field(1, ge=1, le=1024, description="cores of a trial, and its torch threads")
-    gpus: float = Field(0.0, ge=0, le=64, description="GPUs of a trial; a share lets trials fly side by side on one")
+    gpus: float = Field(0.0, ge=0, le=64, description="GPUs of a trial; trials share a GPU if it is a fraction")
 
 
 class SweepConfig(Settings):
-    """A sweep: a grid or a search over any fields of the config that ``sb3-flock train`` takes.
+    """A sweep: a grid or a search over any fields of :class:`~sb3_flock.config.training.TrainingConfig`.
 
-    Fields are named as in ``--set``: leading groups may be left out.
+    Leading groups of a field's name may be left out: ``lambda_`` is ``scenario.reward.lambda_``.
 
     :raises SettingsError: one line naming the parameter, its value and what is accepted
     """
 
-    base: dict[str, Any] = Field({}, description="a training config's file, beside this one, or its fields")
+    base: dict[str, Any] = Field({}, description="file of a training config, beside this one, or a mapping of its fields")
     grid: dict[str, list[Any]] = Field({}, description="values by field: every combination is a trial")
     search: dict[str, list[Any] | Range] = Field(
         {}, description="choices or {low, high, log} by field: Optuna looks for the lowest score at an evaluation"
@@ -58,20 +60,22 @@ class SweepConfig(Settings):
     trials: int = Field(50, ge=1, le=MAX_TRIALS, description="trials of a search")
     search_seed: int = Field(0, ge=0, le=2**32 - 1, description="seed of a search")
     policy: str | None = Field(
-        None, description="fly this policy over the grid; null: train (a zip, a run folder or a name)"
+        None, description="policy to evaluate over the grid (a zip, a run folder or a name); null: train"
     )
-    episodes: int = Field(1000, ge=1, le=1_000_000, description="episodes a trial flies, with a policy")
-    metric: str = Field("score", description="what the statistics rank by: score or a metric of `sb3-flock evaluate`")
+    episodes: int = Field(1000, ge=1, le=1_000_000, description="episodes of each evaluation of a policy")
+    metric: str = Field("score", description="metric of the ranking: score or a metric of the evaluation")
     tasks: list[str] = Field([], description="fields of the grid that make another task, not another setting to rank")
-    resources: Resources = Field(default_factory=Resources, description="what one trial takes")
-    retries: int = Field(3, ge=0, le=1000, description="times that a trial goes on after its machine or process was lost")
+    resources: Resources = Field(default_factory=Resources, description="resources of one trial")
+    retries: int = Field(
+        3, ge=0, le=1000, description="number of times that a trial is resumed after its machine or process was lost"
+    )
 
     @model_validator(mode="after")
     def _check(self) -> SweepConfig:
         if bool(self.grid) == bool(self.search):
             raise ValueError("a grid or a search is needed, and not both")
         if self.search and self.policy is not None:
-            raise ValueError("search: a policy is flown over a grid")
+            raise ValueError("search: a policy is evaluated over a grid")
         for key, values in {**self.grid, **self.search}.items():
             if isinstance(values, list) and (not values or any(value in values[:i] for i, value in enumerate(values))):
                 raise ValueError(f"{key} = {format_value(values)}: a list of different values is needed")
@@ -92,25 +96,26 @@ class SweepConfig(Settings):
         threads = {"torch_threads": self.resources.cpus, "output_dir": "runs"}
         return load_config(TrainingConfig, overrides={**self.base, **point, **threads})
 
-    def flight(self, point: Mapping[str, Any], trained_for: Scenario) -> tuple[Scenario, int]:
-        """The scenario and the seed of the flights at ``point``: the policy's own, changed as ``base`` and ``point`` say.
+    def evaluation(self, point: Mapping[str, Any], trained_for: Scenario) -> tuple[Scenario, int]:
+        """The scenario and the seed of the evaluation at ``point``.
 
-        :raises SettingsError: for a field that does not tell on a flight, or a value that is not accepted
+        :param trained_for: the policy's scenario, which ``base`` and ``point`` change
+        :raises SettingsError: for a field that does not affect an evaluation, or a value that is not accepted
         """
         seed = load_config(TrainingConfig, overrides={key: value for key, value in point.items() if key == "seed"}).seed
         changes = {key: value for key, value in {**self.base, **point}.items() if key.startswith(_SCENARIO)}
-        strange = [key for key in point if key not in changes and key != "seed"]
-        if strange:
-            raise SettingsError(f"grid: {strange[0]} does not tell on a flight, only the scenario's fields and seed do")
+        idle = [key for key in point if key not in changes and key != "seed"]
+        if idle:
+            raise SettingsError(f"grid: {idle[0]} does not affect an evaluation, only the scenario's fields and seed do")
         overrides = {key.removeprefix(_SCENARIO): value for key, value in changes.items()}
         return load_config(Scenario, overrides=overrides, base=trained_for), seed
 
     def points(self) -> list[dict[str, Any]]:
-        """The grid's points, or, of a search, some that try each end of each range and each choice."""
+        """The grid's points; of a search, points that cover each end of each range and each choice."""
         if self.grid:
             return [dict(zip(self.grid, values, strict=True)) for values in itertools.product(*self.grid.values())]
         ends = {
-            key: choices if isinstance(choices, list) else [fitting(key, choices.low), fitting(key, choices.high)]
+            key: choices if isinstance(choices, list) else [_of_field(key, choices.low), _of_field(key, choices.high)]
             for key, choices in self.search.items()
         }
         first = {key: values[0] for key, values in ends.items()}
@@ -120,28 +125,32 @@ class SweepConfig(Settings):
 _SCENARIO = "scenario."
 
 
-def fitting(key: str, value: float) -> float:
-    """An end of a range as its field has it: whole if that is."""
-    return int(value) if is_whole(key) and value == int(value) else value
+def _of_field(key: str, value: float) -> float:
+    """An end of a range in its field's type."""
+    return int(value) if is_integer(key) and value == int(value) else value
 
 
-def is_whole(key: str) -> bool:
-    """Whether a field of the training config, named in full, holds whole numbers."""
+def is_integer(key: str) -> bool:
+    """Whether a field of the training config holds integers.
+
+    :param key: the field's whole path
+    """
     return field_of(TrainingConfig, key).annotation is int
 
 
 def load_sweep(
     path: str | Path, base: Mapping[str, Any] | None = None, text: str | None = None, **changes: Any
 ) -> SweepConfig:
-    """Read a sweep's YAML file.
+    """Read a sweep's YAML file; names of the previous release are read with a warning.
 
     :param base: further fields of the training config that all trials share
-    :param text: the file's text, where it is not a local one
+    :param text: the file's text, if the file is not local
     :param changes: values of this config, instead of the file's
     :raises SettingsError: one line for a file or a value that is not accepted
     """
     values = {**read_yaml(Path(path), text), **changes}
-    for name in ("grid", "search"):  # a list or a scalar is told by name before it is taken apart
+    check_format(values.pop("format", FORMAT))
+    for name in ("grid", "search"):
         if not isinstance(values.get(name, {}), Mapping):
             raise SettingsError(f"{name} = {format_value(values[name])}: a mapping of fields to values is needed")
     shared = values.get("base") or {}
@@ -153,8 +162,8 @@ def load_sweep(
     added = _named_in_full((base or {}).items())
     idle = [name for name in added if values.get("policy") is not None and not name.startswith(_SCENARIO)]
     if idle:
-        raise SettingsError(f"{idle[0]} does not tell on a flight, only the scenario's fields do")
-    values["base"] = {**_named_in_full(_leaves(shared)), **added}
+        raise SettingsError(f"{idle[0]} does not affect an evaluation, only the scenario's fields do")
+    values["base"] = {**_without_idle_options(dict(_leaves(shared))), **added}
     for name in ("grid", "search"):
         values[name] = _named_in_full(values.get(name, {}).items())
     if isinstance(values.get("tasks"), list):
@@ -168,10 +177,23 @@ def _named_in_full(items: Iterable[tuple[str, Any]]) -> dict[str, Any]:
         name = ".".join(resolve_path(TrainingConfig, str(key)))
         if name in _GIVEN:
             raise SettingsError(f"{name}: a sweep sets it by itself")
-        if name == "init_from":  # trials run elsewhere
+        if name == "init_from":  # trials run in other working directories
             named[name] = [_absolute(path) for path in value] if isinstance(value, list) else _absolute(value)
         else:
             named[name] = value
+    return named
+
+
+def _without_idle_options(base: Mapping[str, Any]) -> dict[str, Any]:
+    """The shared fields under their whole names.
+
+    The previous release wrote the base's file out in full, and ignored these options where they did not apply to a trial's
+    algorithm. They are refused there now; without a value they apply where they can.
+    """
+    named = _named_in_full(base.items())
+    if any(rename_key(key) != key for key in base):
+        idle = {"algorithm.mirror_augmentation": True, "network.action_bound": "inverting"}
+        return {name: value for name, value in named.items() if name not in idle or value != idle[name]}
     return named
 
 

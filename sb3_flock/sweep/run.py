@@ -1,4 +1,4 @@
-"""Runs a sweep by Ray Tune: on this machine or a cluster, in a folder from which it can go on."""
+"""Runs a sweep by Ray Tune, on this machine or a cluster, in a folder from which the sweep can be resumed."""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sb3_flock._compat import find_ray_cluster, ray_trials
+from sb3_flock._renamed import rename_key
 from sb3_flock.evaluation.metrics import METRICS
 from sb3_flock.serialization.yaml_io import to_yaml
 from sb3_flock.settings import RunError, SettingsError
-from sb3_flock.sweep.config import SweepConfig, is_whole, load_sweep
+from sb3_flock.sweep.config import SweepConfig, is_integer, load_sweep
 
 if TYPE_CHECKING:
     from fsspec import AbstractFileSystem
@@ -35,19 +36,21 @@ class Trial:
     name: str
     point: dict[str, Any]
     status: str
-    """``done``, ``diverged``, ``refused`` or ``failed``, which alone a resumed sweep tries again."""
+    """``done``, ``diverged``, ``refused``, ``failed`` or ``unfinished``; a resumed sweep continues the last two."""
     why: str
+    """Cause of a status other than ``done``, or empty."""
     metrics: dict[str, float]
     """Means over the episodes of the test: :data:`~sb3_flock.evaluation.metrics.METRICS` and ``score``; empty if not done."""
     report: dict[str, Any]
-    """The trial's last report."""
+    """The last report of the trial."""
     run: str
-    """Where its run folder is in the sweep's; empty if nothing was saved."""
+    """Path of its run folder in the sweep's folder; empty if nothing was saved."""
 
 
 class Folder:
-    """Where a sweep's results go: a local or shared folder, or any URL that fsspec knows.
+    """The folder of a sweep's results: local, shared, or any URL that fsspec knows.
 
+    :param out: path or URL
     :raises SettingsError: for a URL that cannot be used
     """
 
@@ -58,41 +61,41 @@ class Folder:
             self.filesystem: AbstractFileSystem
             self.filesystem, path = fsspec.core.url_to_fs(out)
         except (ImportError, ValueError, OSError) as error:
-            raise SettingsError(f"--out {out}: {' '.join(str(error).split())}") from None
+            raise SettingsError(f"out = {out}: {' '.join(str(error).split())}") from None
         self.name = out
         self.path = path.rstrip("/")
         self.is_plain = "://" not in out and "::" not in out
 
     def of(self, name: str) -> str:
-        """Path of a file in it."""
+        """Path of a file in the folder."""
         return posixpath.join(self.path, name)
 
     def exists(self, name: str = "") -> bool:
-        """Whether there is a file of this name."""
-        with self.faults_told():
+        """Whether the folder, or a file of this name in it, exists."""
+        with self._storage_errors():
             return bool(self.filesystem.exists(self.of(name) if name else self.path))
 
     def write(self, name: str, data: bytes) -> None:
         """Write a file."""
-        with self.faults_told():
+        with self._storage_errors():
             self.filesystem.makedirs(self.path, exist_ok=True)
             self.filesystem.pipe_file(self.of(name), data)
 
     def read(self, name: str) -> bytes:
         """A file's bytes."""
-        with self.faults_told():
+        with self._storage_errors():
             return bytes(self.filesystem.cat_file(self.of(name)))
 
     @contextmanager
-    def faults_told(self) -> Iterator[None]:
-        """What goes wrong with the storage, in one line."""
+    def _storage_errors(self) -> Iterator[None]:
+        """Report errors of the storage as one line."""
         try:
             yield
         except OSError as error:
-            raise SettingsError(f"--out {self.name}: {error.strerror or ' '.join(str(error).split())}") from None
+            raise SettingsError(f"out = {self.name}: {error.strerror or ' '.join(str(error).split())}") from None
 
     def for_ray(self) -> dict[str, Any]:
-        """As Ray Tune takes it; a plain path it handles itself, and checks that all machines share it."""
+        """The arguments of Ray Tune for this storage; Ray itself handles a plain path, and checks that all machines share it."""
         if self.is_plain:
             return {}
         from pyarrow.fs import FSSpecHandler, PyFileSystem
@@ -103,9 +106,9 @@ class Folder:
 def sweep(config: SweepConfig, out: str, address: str | None = None) -> list[Trial]:
     """Run every trial, and leave ``results.csv`` and each trial's run folder in ``out``.
 
-    :param config: what to vary
+    :param config: the sweep
     :param out: a new folder, or the URL of one
-    :param address: a running Ray cluster's, such as ``"auto"``; ``None`` starts one on this machine's cores
+    :param address: address of a running Ray cluster, such as ``"auto"``; ``None`` starts one on this machine's cores
     :raises SettingsError: for a value of a point that is not accepted, or a folder or an address that cannot be used
     :raises PolicyError: for a policy that cannot be used
     :raises RunError: if Ray does not run
@@ -114,7 +117,7 @@ def sweep(config: SweepConfig, out: str, address: str | None = None) -> list[Tri
     policy = _check_points(config)
     folder = Folder(out)
     if folder.exists():
-        raise SettingsError(f"--out {out}: it exists already; to go on with a sweep: sb3-flock sweep --resume {out}")
+        raise SettingsError(f"out = {out}: exists already; resume {out} to continue a sweep")
     with _cluster(config, address):
         folder.write(_CONFIG, to_yaml(config).encode())
         if policy is not None:
@@ -123,9 +126,9 @@ def sweep(config: SweepConfig, out: str, address: str | None = None) -> list[Tri
 
 
 def resume_sweep(out: str, address: str | None = None) -> tuple[SweepConfig, list[Trial]]:
-    """Go on with a sweep: unfinished trials from their last checkpoints, failed ones too.
+    """Continue a sweep: unfinished and failed trials resume from their last checkpoints.
 
-    Ray keeps the state of a sweep as pickles, which run any code that is in them: go on with your own sweeps only.
+    Ray keeps the state of a sweep as pickles, which run any code in them: resume your own sweeps only.
 
     :param out: the folder of :func:`sweep`
     :raises SettingsError: for a folder without a sweep
@@ -134,7 +137,7 @@ def resume_sweep(out: str, address: str | None = None) -> tuple[SweepConfig, lis
     _check_ray(address)
     folder = Folder(out)
     if not folder.exists(_CONFIG):
-        raise SettingsError(f"--resume {out}: not a sweep's folder (there is no {_CONFIG})")
+        raise SettingsError(f"resume {out}: not a sweep's folder (there is no {_CONFIG})")
     config = load_sweep(_CONFIG, text=folder.read(_CONFIG).decode())
     policy = folder.read(_POLICY) if config.policy is not None else None
     with _cluster(config, address):
@@ -142,7 +145,7 @@ def resume_sweep(out: str, address: str | None = None) -> tuple[SweepConfig, lis
 
 
 def _check_points(config: SweepConfig) -> bytes | None:
-    """Whether every trial's config is accepted, which is better told now than by each trial; and the policy's zip."""
+    """Check every trial's config before the first one starts; returns the policy's zip, if there is a policy."""
     if config.policy is None:
         for point in config.points():
             trained = config.training(point)
@@ -151,14 +154,14 @@ def _check_points(config: SweepConfig) -> bytes | None:
         return None
     from sb3_flock.serialization.load import load_policy
 
-    flyer = load_policy(config.policy)
+    policy = load_policy(config.policy)
     for point in config.points():
-        flyer.check(config.flight(point, flyer.scenario)[0])
-    return flyer.path.read_bytes()
+        policy.check(config.evaluation(point, policy.scenario)[0])
+    return policy.path.read_bytes()
 
 
 def _check_ray(address: str | None) -> None:
-    """Whether all is installed, and a cluster answers, for which Ray would try for minutes."""
+    """Check that the extra is installed and that the cluster answers; Ray itself would wait for minutes."""
     missing = [name for name in ("ray", "optuna", "rliable") if importlib.util.find_spec(name) is None]
     if missing:
         raise SettingsError(f"a sweep needs {missing[0]}: pip install 'sb3_flock[ray]'")
@@ -169,20 +172,20 @@ def _check_ray(address: str | None) -> None:
         host, _, port = found.removeprefix("ray://").rpartition(":")
         socket.create_connection((host, int(port)), timeout=10).close()
     except (OSError, ValueError) as error:
-        raise SettingsError(f"--address {address}: no Ray cluster answers there ({' '.join(str(error).split())})") from None
+        raise SettingsError(f"address = {address}: no Ray cluster answers there ({' '.join(str(error).split())})") from None
 
 
 @contextmanager
 def _cluster(config: SweepConfig, address: str | None) -> Iterator[None]:
-    """Ray, on this machine or where the address says, as long as it is needed."""
+    """Ray, on this machine or at the address, as long as the context is open."""
     os.environ.update(RAY_USAGE_STATS_ENABLED="0", TUNE_DISABLE_AUTO_CALLBACK_LOGGERS="1", RAY_AIR_NEW_OUTPUT="0")
     import ray
 
-    logging.getLogger("ray.tune").setLevel(logging.CRITICAL)  # tracebacks of lost machines; our table tells of them
+    logging.getLogger("ray.tune").setLevel(logging.CRITICAL)  # tracebacks of lost machines, which TrialsTable reports
     try:
         ray.init(address=address or "local", include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
     except (ConnectionError, ValueError, RuntimeError) as error:
-        raise SettingsError(f"--address {address}: {' '.join(str(error).split())}") from None
+        raise SettingsError(f"address = {address}: {' '.join(str(error).split())}") from None
     try:
         have = ray.cluster_resources()  # type: ignore[no-untyped-call]
         for name, wanted in (("CPU", config.resources.cpus), ("GPU", config.resources.gpus)):
@@ -215,7 +218,7 @@ def _run(config: SweepConfig, folder: Folder, policy: bytes | None) -> list[Tria
         ended = [_ended(trial, folder) for trial in ray_trials(results)]
         trials = sorted(ended, key=lambda trial: trial.name)
     except tune.TuneError as error:
-        raise RunError(f"{str(error).strip().splitlines()[-1]}; to go on: sb3-flock sweep --resume {folder.name}") from error
+        raise RunError(f"{str(error).strip().splitlines()[-1]}; resume {folder.name} to continue") from error
     folder.write(RESULTS, _as_csv(config, trials).encode())
     return trials
 
@@ -257,13 +260,13 @@ def _new_tuner(config: SweepConfig, folder: Folder, trial: Any, storage: Mapping
 
 
 def trial_name(trial: Any) -> str:
-    """A trial's number and its point, as a folder's name."""
+    """A trial's number and its point, as the name of a folder."""
     words = [f"{key.split('.')[-1]}={short(value)}" for key, value in trial.config.items()]
     return re.sub(r"[^\w.=+-]+", "_", "-".join([trial.trial_id.split("_")[-1], *words]))[:120]
 
 
 def short(value: Any) -> str:
-    """A value of a point as it is shown."""
+    """A value of a point as tables show it."""
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
@@ -274,7 +277,7 @@ def _distributions(config: SweepConfig) -> dict[str, Any]:
     for key, choices in config.search.items():
         if isinstance(choices, list):
             space[key] = CategoricalDistribution(choices)
-        elif is_whole(key):
+        elif is_integer(key):
             space[key] = IntDistribution(int(choices.low), int(choices.high), log=choices.log)
         else:
             space[key] = FloatDistribution(choices.low, choices.high, log=choices.log)
@@ -288,7 +291,7 @@ def _ended(trial: Any, folder: Folder) -> Trial:
     saved = trial.checkpoint
     return Trial(
         name=str(trial),
-        point=dict(trial.config),
+        point={rename_key(key): value for key, value in trial.config.items()},
         status="failed" if failed else report.get("status", "unfinished"),
         why=_first_cause(trial) if failed else report.get("why", ""),
         metrics={name: float(test[name]) for name in (*METRICS, "score") if name in test},
@@ -298,12 +301,12 @@ def _ended(trial: Any, folder: Folder) -> Trial:
 
 
 def _first_cause(trial: Any) -> str:
-    """The last line of what the trial's process raised: the error itself."""
+    """The last line of the exception of the trial's process."""
     try:
         lines = str(trial.get_pickled_error() or trial.get_error()).strip().splitlines()
     except Exception:
         lines = []
-    return lines[-1] if lines else "no error was left"
+    return lines[-1] if lines else "the trial left no error"
 
 
 def _as_csv(config: SweepConfig, trials: Sequence[Trial]) -> str:

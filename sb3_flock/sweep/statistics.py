@@ -1,7 +1,8 @@
-"""What a sweep's trials say together, by rliable (Agarwal et al., 2021): few seeds rank nothing without their spread.
+"""Statistics over a sweep's trials, by rliable (Agarwal et al., 2021).
 
-The interquartile mean over runs and tasks with its 95 % interval from a bootstrap stratified by task, performance profiles, and
-the probability that a run of one setting is better than one of another.
+A few seeds give no ranking without their spread. The statistics are the interquartile mean over runs and tasks with its 95 %
+interval from a bootstrap stratified by task, performance profiles, and the probability that a run of one setting is better
+than a run of another.
 """
 
 from __future__ import annotations
@@ -30,9 +31,9 @@ if TYPE_CHECKING:
 
 _RESAMPLES = 2_000
 _BEST = 10
-"""Trials of a search that are shown."""
+"""Number of trials in the table of a search."""
 _POINTS = 101
-"""Values of the metric at which a profile is drawn."""
+"""Number of metric values at which a profile is drawn."""
 _STYLES = [marker + line for marker in ("", "o", "s", "^", "x") for line in LINE_STYLES]
 
 
@@ -44,21 +45,21 @@ class Setting:
     values: NDArray[np.float64]
     """``(runs, tasks)``, in the metric's own unit."""
     lost: int
-    """Trials that did not end with a test, which the statistics leave out together with the same seed's of other tasks."""
-    mean: float
+    """Trials that did not end with a test. The statistics leave out their seeds, in every task."""
+    iqm: float
     low: float
     high: float
     """Interquartile mean with its 95 % interval."""
-    beaten: float
-    beaten_low: float
-    beaten_high: float
-    """Probability that a run of the best setting is better than one of this, with its 95 % interval; NaN for the best itself."""
+    p_best_better: float
+    p_low: float
+    p_high: float
+    """Probability that a run of the best setting is better than a run of this one, with its 95 % interval; NaN for the best."""
 
 
 def report(config: SweepConfig, trials: Sequence[Trial], out: str) -> list[Table]:
-    """The tables for a terminal; of a grid of trainings writes ``ranking.csv``, ``ranking.png`` and ``ranking.svg`` to ``out``.
+    """The tables for a terminal; for a grid of trainings also writes ``ranking.csv``, ``.png`` and ``.svg`` to ``out``.
 
-    A search's trials are one each and chosen by their score: it has a table of the best, and no ranking.
+    A search has a table of its best trials and no ranking: each of its points has one trial, and is chosen by the score.
     """
     if config.policy is not None:
         return [trials_table(config, trials)]
@@ -79,7 +80,7 @@ def report(config: SweepConfig, trials: Sequence[Trial], out: str) -> list[Table
 
 
 def trials_table(config: SweepConfig, trials: Sequence[Trial]) -> Table:
-    """Each trial's metrics, a line each."""
+    """The metrics of each trial, one line each."""
     keys = [*(config.grid or config.search)]
     table = plain_table()
     for key in keys:
@@ -90,12 +91,17 @@ def trials_table(config: SweepConfig, trials: Sequence[Trial]) -> Table:
     return table
 
 
+def _heading(metric: str) -> str:
+    """The metric's heading in narrow tables, or its name."""
+    return (METRICS[metric].column if metric in METRICS else None) or metric
+
+
 def _format(metric: str, value: float) -> str:
     return METRICS[metric].format(value) if metric in METRICS else f"{value:.3f}"
 
 
 def rank(config: SweepConfig, trials: Sequence[Trial], metric: str) -> list[Setting]:
-    """The settings of a grid, best first: those without a finished run are left out.
+    """The settings of a grid, best first, without those that have no finished run.
 
     :param metric: ``score`` or one of :data:`~sb3_flock.evaluation.metrics.METRICS`
     """
@@ -106,18 +112,18 @@ def rank(config: SweepConfig, trials: Sequence[Trial], metric: str) -> list[Sett
     larger_is_better = {name: sign * values for name, (values, _) in by_name.items() if values.size}
     if not larger_is_better:
         return []
-    means, spans = _intervals(larger_is_better, lambda values: np.array([metrics.aggregate_iqm(values)]))
+    means, intervals = _intervals(larger_is_better, lambda values: np.array([metrics.aggregate_iqm(values)]))
     order = sorted(means, key=lambda name: -float(means[name][0]))
     best = order[0]
     pairs = {name: (larger_is_better[best], larger_is_better[name]) for name in order[1:]}
-    beaten, beaten_spans = _intervals(pairs, lambda x, y: np.array([metrics.probability_of_improvement(x, y)]))
+    wins, win_intervals = _intervals(pairs, lambda x, y: np.array([metrics.probability_of_improvement(x, y)]))
     return [
         Setting(
             name,
             *by_name[name],
             sign * float(means[name][0]),
-            *sorted(sign * float(end) for end in spans[name][:, 0]),
-            *((np.nan, np.nan, np.nan) if name == best else (float(beaten[name][0]), *map(float, beaten_spans[name][:, 0]))),
+            *sorted(sign * float(end) for end in intervals[name][:, 0]),
+            *((np.nan, np.nan, np.nan) if name == best else (float(wins[name][0]), *map(float, win_intervals[name][:, 0]))),
         )
         for name in order
     ]
@@ -134,7 +140,10 @@ def _by_setting(config: SweepConfig, trials: Sequence[Trial]) -> dict[str, list[
 
 
 def _matrix(config: SweepConfig, trials: Sequence[Trial], metric: str) -> tuple[NDArray[np.float64], int]:
-    """``(runs, tasks)``, a run being a seed that ended in every task with this metric defined; and how many trials did not."""
+    """The values ``(runs, tasks)`` and the number of trials that did not end.
+
+    A run is a seed that ended in every task with this metric defined.
+    """
     tasks: dict[str, dict[Any, float]] = {}
     for trial in trials:
         value = trial.metrics.get(metric, np.nan) if trial.status == DONE else np.nan
@@ -152,7 +161,7 @@ def _intervals(scores: dict[str, Any], statistic: Callable[..., Any]) -> tuple[d
     if not scores:
         return {}, {}
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FutureWarning)  # rliable hands its generator to arch by an old name
+        warnings.simplefilter("ignore", FutureWarning)  # rliable passes its generator to arch under an old name
         random = np.random.RandomState(0)
         found: tuple[dict[str, Any], dict[str, Any]] = library.get_interval_estimates(
             scores, statistic, reps=_RESAMPLES, random_state=random
@@ -161,34 +170,38 @@ def _intervals(scores: dict[str, Any], statistic: Callable[..., Any]) -> tuple[d
 
 
 def ranking_table(settings: Sequence[Setting], metric: str) -> Table:
-    """The settings, best first, a line each."""
+    """The settings, best first, one line each."""
     table = plain_table()
     table.add_column("setting", overflow="fold")
-    for heading in ("runs", "lost", f"IQM {metric}", "95 % interval", "P(best better)"):
+    for heading in ("runs", "lost", f"IQM {_heading(metric)}", "95 % interval", "P(best better)"):
         table.add_column(heading, justify="right")
     for setting in settings:
-        span = f"{_format(metric, setting.low)} .. {_format(metric, setting.high)}"
-        beaten = f"{setting.beaten:.2f} ({setting.beaten_low:.2f} .. {setting.beaten_high:.2f})"
-        shape = str(len(setting.values)), str(setting.lost)
-        table.add_row(setting.name, *shape, _format(metric, setting.mean), span, "" if np.isnan(setting.beaten) else beaten)
+        is_best = np.isnan(setting.p_best_better)
+        table.add_row(
+            setting.name,
+            str(len(setting.values)),
+            str(setting.lost),
+            _format(metric, setting.iqm),
+            f"{_format(metric, setting.low)} .. {_format(metric, setting.high)}",
+            "" if is_best else f"{setting.p_best_better:.2f} ({setting.p_low:.2f} .. {setting.p_high:.2f})",
+        )
     return table
 
 
 def ranking_csv(settings: Sequence[Setting], metric: str) -> str:
     """The same as CSV."""
     text = io.StringIO()
-    numbers = ("mean", "low", "high", "beaten", "beaten_low", "beaten_high")
     columns = ("iqm", "low", "high", "p_best_better", "p_low", "p_high")
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["metric", "setting", "runs", "tasks", "lost", *columns])
     for setting in settings:
-        values = [getattr(setting, name) for name in numbers]
+        values = [getattr(setting, name) for name in columns]
         writer.writerow([metric, setting.name, *setting.values.shape, setting.lost, *values])
     return text.getvalue()
 
 
 def ranking_figure(settings: Sequence[Setting], metric: str) -> Figure:
-    """Interquartile means with their intervals beside the performance profiles, readable in greyscale."""
+    """Interquartile means with their intervals beside the performance profiles, legible in grayscale."""
     from rliable import library
 
     figure, (means, profiles) = new_figure(10.0, 1.5 + 0.45 * max(5, len(settings)), columns=2)
@@ -196,7 +209,7 @@ def ranking_figure(settings: Sequence[Setting], metric: str) -> Figure:
     for row, setting in enumerate(settings):
         means.plot([setting.low, setting.high], [row, row], "-", color="0.5", linewidth=4, solid_capstyle="butt")
         means.plot(setting.values.ravel(), np.full(setting.values.size, row), "|", color="black", markersize=9)
-        means.plot(setting.mean, row, "o", color="black")
+        means.plot(setting.iqm, row, "o", color="black")
     means.set_yticks(range(len(names)), names)
     means.invert_yaxis()
     means.set(xlabel=metric, title="interquartile mean, 95 % interval, runs")

@@ -1,4 +1,4 @@
-"""A sweep while it runs: a live table in a terminal, plain lines elsewhere."""
+"""The progress of a sweep: a live table in a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from sb3_flock.evaluation.metrics import columns
+from sb3_flock.evaluation.metrics import METRICS, columns
 from sb3_flock.evaluation.report import add_short_columns, plain_table, short_cells
 
 _OTHER_COLUMNS = 54
-"""Width of the table beside the trials' names."""
+"""Width of all columns but the trials' names."""
 
 
 class TrialsTable(tune.Callback):
-    """The trials that run and those that ended last, with their latest evaluations.
+    """The running trials and those that ended last, with their latest evaluations.
 
-    Ray pickles it with the sweep's state and makes a new one when it goes on.
+    Ray pickles this callback with the sweep's state; unpickled, it is a new one.
     """
 
     def __init__(self) -> None:
@@ -35,37 +35,37 @@ class TrialsTable(tune.Callback):
         return type(self), ()
 
     def on_step_end(self, iteration: int, trials: list[Any], **info: Any) -> None:
-        """Draw again, once a second at most."""
+        """Redraw, once a second at most."""
         if self.console.is_terminal and time.monotonic() - self._drawn > 1.0:
             self._draw(trials)
 
     def on_trial_start(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
-        """A trial begins or goes on."""
-        self._tell(trials, f"{trial}: starts")
+        """A trial starts or resumes."""
+        self._report(trials, f"{trial}: starts")
 
     def on_trial_recover(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
-        """A trial was lost with its process or its machine, and will go on."""
-        self._tell(trials, f"{trial}: lost; goes on from its last checkpoint")
+        """A trial was lost with its process or its machine, and will resume."""
+        self._report(trials, f"{trial}: lost; resumes from its last checkpoint")
 
     def on_trial_complete(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
-        """A trial has ended by itself."""
+        """A trial has ended."""
         self._ended.append(trial)
-        named = zip((metric.column for metric in columns().values()), _cells(trial), strict=True)
-        self._tell(trials, f"{trial}: {', '.join([_state(trial), *(f'{name} {cell}' for name, cell in named if cell)])}")
+        named = zip((METRICS[name].column for name in columns()), _cells(trial), strict=True)
+        self._report(trials, f"{trial}: {', '.join([_state(trial), *(f'{name} {cell}' for name, cell in named if cell)])}")
 
     def on_trial_error(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
-        """A trial has failed for good."""
+        """A trial has failed, after all retries."""
         self._ended.append(trial)
-        self._tell(trials, f"{trial}: failed")
+        self._report(trials, f"{trial}: failed")
 
     def on_experiment_end(self, trials: list[Any], **info: Any) -> None:
-        """Leave the last table on the screen."""
+        """Draw the last table, which stays on the screen."""
         if self._live is not None:
             self._draw(trials)
             self._live.stop()
             self._live = None
 
-    def _tell(self, trials: list[Any], line: str) -> None:
+    def _report(self, trials: list[Any], line: str) -> None:
         if self.console.is_terminal:
             self._draw(trials)
         else:
@@ -102,7 +102,7 @@ _STATES = {"PENDING": "waiting", "RUNNING": "running", "PAUSED": "waiting", "ERR
 
 
 def _state(trial: Any) -> str:
-    """As its last report says, or Ray."""
+    """The status in the last report; without one, Ray's."""
     return str((trial.last_result or {}).get("status", _STATES[trial.status]))
 
 
@@ -113,6 +113,6 @@ def _share(trial: Any) -> str:
 
 
 def _cells(trial: Any) -> list[str]:
-    """The test's metrics, or the last evaluation's."""
+    """The metrics of the test; before it, of the last evaluation."""
     report = trial.last_result or {}
     return short_cells({**report, **report.get("test", {})}, missing="")

@@ -1,4 +1,4 @@
-"""What one trial of a sweep does, in a process of its own on any machine of the cluster."""
+"""One trial of a sweep, in a process of its own on any machine of the cluster."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ from sb3_flock.sweep.config import SweepConfig
 from sb3_flock.training.train import resume, train
 
 TEST_SEED = 0
-"""Seed of the episodes that a trained policy is tested on: those of ``sb3-flock train``'s table, which nothing is chosen by."""
+"""Seed of the test episodes, those of the final table of a training; no policy is chosen by them."""
 
 DONE, DIVERGED, REFUSED = "done", "diverged", "refused"
 
 
 def train_trial(point: dict[str, Any], sweep: Mapping[str, Any]) -> None:
-    """Train at one point of a sweep, or go on from its last checkpoint, then test what was learned.
+    """Train at one point of a sweep, or resume from its last checkpoint, then test the policy.
 
-    Whatever would end in the same way again is reported as the trial's status; anything else raises, and Ray tries again,
+    An error that would repeat is reported as the trial's status. Any other error is raised, and Ray tries the trial again,
     there or on another machine.
 
     :param point: the trial's own fields of the training config
@@ -43,7 +43,7 @@ def train_trial(point: dict[str, Any], sweep: Mapping[str, Any]) -> None:
     started = time.monotonic()
     reports = Reports(config.total_timesteps)
     try:
-        folder = _train_or_go_on(config, reports)
+        folder = _train_or_resume(config, reports)
         reports.read(folder)
         th.set_num_threads(1)
         metrics = evaluate(load_policy(folder), config.scenario, config.n_test_episodes, TEST_SEED)
@@ -55,11 +55,11 @@ def train_trial(point: dict[str, Any], sweep: Mapping[str, Any]) -> None:
     except UserError as error:
         tune.report({**reports.row, "status": REFUSED, "why": str(error), "score": float("inf")})
     finally:
-        shutil.rmtree(config.output_dir, ignore_errors=True)  # Ray keeps a copy, where it belongs
+        shutil.rmtree(config.output_dir, ignore_errors=True)  # Ray keeps a copy in the sweep's folder
 
 
-def _train_or_go_on(config: TrainingConfig, reports: Reports) -> Path:
-    """The run folder, complete, in the trial's own working directory."""
+def _train_or_resume(config: TrainingConfig, reports: Reports) -> Path:
+    """Train to the end; returns the run folder, in the trial's own working directory."""
     console = Console(stderr=True, force_terminal=False, width=200)
     saved = tune.get_checkpoint()
     if saved is None:
@@ -72,7 +72,7 @@ def _train_or_go_on(config: TrainingConfig, reports: Reports) -> Path:
 
 
 class Reports(BaseCallback):
-    """Tells Ray about every evaluation, and hands it a copy of the run folder after every checkpoint."""
+    """Reports every evaluation to Ray, with a copy of the run folder after every checkpoint."""
 
     def __init__(self, total_timesteps: int) -> None:
         super().__init__()
@@ -88,7 +88,7 @@ class Reports(BaseCallback):
         return True
 
     def _on_rollout_start(self) -> None:
-        """The checkpoint that Ray gets is the one written before the last vector step, beside what was written since."""
+        """Report what was written during the last vector step."""
         before, self._seen = self._seen, self.read(self._folder, self._seen)
         if self._seen != before:
             self.row["timesteps"] = self.num_timesteps
@@ -100,7 +100,10 @@ class Reports(BaseCallback):
         return Path(self.logger.get_dir() or ".")
 
     def read(self, folder: Path, seen: tuple[Path | None, int] = (None, 0)) -> tuple[Path | None, int]:
-        """The newest checkpoint and the time of the last evaluation, which goes into the row unless it was seen."""
+        """The newest checkpoint and the time of the last evaluation; a new evaluation is copied into the row.
+
+        :param seen: the previous result
+        """
         saved, history = checkpoint_paths(folder)[-1:], folder / "evaluations.npz"
         evaluated = history.stat().st_mtime_ns if history.exists() else 0
         if evaluated != seen[1]:
@@ -111,24 +114,24 @@ class Reports(BaseCallback):
 
 
 def evaluate_trial(point: dict[str, Any], sweep: Mapping[str, Any], policy: bytes) -> None:
-    """Fly a policy at one point of a sweep.
+    """Evaluate a policy at one point of a sweep.
 
     :param policy: the policy's zip
     """
     th.set_num_threads(1)
     config = SweepConfig(**sweep)
     started = time.monotonic()
-    flyer = load_shipped(policy)
-    scenario, seed = config.flight(point, flyer.scenario)
+    loaded = _load_bytes(policy)
+    scenario, seed = config.evaluation(point, loaded.scenario)
     try:
-        metrics = evaluate(flyer, scenario, config.episodes, seed)
+        metrics = evaluate(loaded, scenario, config.episodes, seed)
     except UserError as error:
         tune.report({"status": REFUSED, "why": str(error)})
         return
     tune.report({"status": DONE, "minutes": (time.monotonic() - started) / 60, **_tested(metrics)})
 
 
-def load_shipped(policy: bytes) -> LoadedPolicy:
+def _load_bytes(policy: bytes) -> LoadedPolicy:
     """A policy from the bytes of its zip."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "policy.zip"
@@ -137,6 +140,6 @@ def load_shipped(policy: bytes) -> LoadedPolicy:
 
 
 def _tested(metrics: Mapping[str, Metric]) -> dict[str, Any]:
-    """The test's means as a report."""
+    """The means of the test, as a report."""
     means = {name: np.nan if metric.mean is None else metric.mean for name, metric in metrics.items()}
     return {"test": {**means, "score": score(means)}}

@@ -1,4 +1,4 @@
-"""What the benchmarks share: one torch thread, the peers' own Python, and figures that land in the JSON."""
+"""Fixtures of the benchmarks: the peers, which run in a Python of their own."""
 
 import json
 import os
@@ -9,12 +9,12 @@ import pytest
 
 PEERS = Path(__file__).parent / "peers"
 POLICY = "ddpg-5v2o"
-"""The shipped policy whose flocks are measured."""
+"""The shipped policy whose flocks the benchmarks measure."""
 
 
 @pytest.fixture
 def peer(request):
-    """Run one of the peers' scripts by the Python in ``SB3_FLOCK_PEERS`` and return what it measured; skip without it."""
+    """A function that runs a peer's script by the Python in ``SB3_FLOCK_PEERS`` and returns its results; skips without it."""
     python = os.environ.get("SB3_FLOCK_PEERS")
     option = request.config.getoption
     if python is None or (option("benchmark_disable") and not option("benchmark_enable")):

@@ -1,4 +1,4 @@
-"""Draw seconds per step against the number of vehicles: ``python tests/benchmarks/plot_crowd.py benchmarks.json crowd.png``."""
+"""Plot seconds per step against the number of vehicles: ``python tests/benchmarks/plot_crowd.py benchmarks.json crowd.png``."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from matplotlib import pyplot as plt
 
 
 def main(source: str, target: str) -> None:
-    """Read pytest-benchmark's JSON and write the picture."""
+    """Read pytest-benchmark's JSON and write the figure."""
     rows = [
         (row["params"]["n_vehicles"], row["extra_info"])
         for row in json.loads(Path(source).read_text())["benchmarks"]

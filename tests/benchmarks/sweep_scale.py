@@ -1,9 +1,9 @@
-"""What a sweep costs beside its trainings: ``python tests/benchmarks/sweep_scale.py``.
+"""The cost of a sweep beside its trainings: ``python tests/benchmarks/sweep_scale.py``.
 
-The same four trainings with one worker and with two, each a Ray cluster of that many cores on this machine: the wall time, the
-seconds spent training, and what is left over for each trial (its process's start, imports, the test's episodes apart). Then many
-trials that do nothing but report, which shows what the driver alone can carry, and a checkpoint of the size of a whole training
-written to the sweep's folder. Prints a line a measurement.
+The first measurement is the same four trainings with one worker and with two, each a Ray cluster of that many cores on this
+machine: the wall time, the seconds in trials, and the rest for each trial (start of the process, imports). The second is many
+trials that only report, which measures the driver alone. The third, with ``--run``, is a copy of a whole run folder into the
+sweep's folder. Prints one line for each measurement.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def report_only(point: dict[str, Any]) -> None:
 
 
 def driver_alone(trials: int, folder: Path) -> float:
-    """Seconds a trial that the driver needs, with two workers that are kept from trial to trial."""
+    """Seconds of the driver for each trial, with two workers that stay from trial to trial."""
     os.environ.update(TUNE_DISABLE_AUTO_CALLBACK_LOGGERS="1", RAY_AIR_NEW_OUTPUT="0")
     import ray
     from ray import tune
@@ -70,7 +70,7 @@ def driver_alone(trials: int, folder: Path) -> float:
 
 
 def checkpoint_cost(run: Path, folder: Path) -> tuple[float, float]:
-    """Megabytes of a whole run folder, and the seconds that Ray's copy of it takes."""
+    """Megabytes of a whole run folder, and the seconds of Ray's copy."""
     import pyarrow.fs
 
     (folder / "copy").mkdir()
@@ -84,8 +84,8 @@ def main() -> None:
     """Measure everything."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--trials", type=int, default=4, help="trainings of a sweep")
-    parser.add_argument("--empty", type=int, default=300, help="trials that do nothing")
-    parser.add_argument("--run", type=Path, help="a run folder, to measure how long its copy takes")
+    parser.add_argument("--empty", type=int, default=300, help="trials that only report")
+    parser.add_argument("--run", type=Path, help="a run folder, to measure the time of its copy")
     options = parser.parse_args()
     walls = {}
     for workers in (1, 2):
@@ -94,7 +94,8 @@ def main() -> None:
         inside = 60 * sum(float(row["minutes"]) for row in rows)
         left = (workers * walls[workers] - inside) / options.trials
         print(
-            f"{workers} workers: {walls[workers]:.1f} s, {inside:.1f} s in trials, {left:.1f} s besides for each", flush=True
+            f"{workers} workers: {walls[workers]:.1f} s, {inside:.1f} s in trials, {left:.1f} s more for each trial",
+            flush=True,
         )
     print(f"speed-up {walls[1] / walls[2]:.2f}", flush=True)
     with tempfile.TemporaryDirectory() as folder:

@@ -20,14 +20,14 @@ UPDATES = 25
 
 
 KINDS = {
-    "stock": (DDPG, PlainCNN, False, None),  # SB3's DDPG, torch's convolutions and Adam, SB3's buffer
-    "stock with our extractor and fused Adam": (DDPG, FlockCNN, True, None),  # --algo ddpg-sb3
-    "ours": (FlockDDPG, FlockCNN, True, CompactReplayBuffer),  # --algo ddpg
+    "sb3": (DDPG, PlainCNN, False, None),  # SB3's DDPG, torch's convolutions and Adam, SB3's buffer
+    "sb3 with FlockCNN and fused Adam": (DDPG, FlockCNN, True, None),  # --algo ddpg-sb3
+    "sb3_flock": (FlockDDPG, FlockCNN, True, CompactReplayBuffer),  # --algo ddpg
 }
 
 
-def learner(kind, env):
-    """A model whose buffer is filled and which has not learned yet."""
+def untrained_model(kind, env):
+    """A model with a filled buffer and no update yet."""
     algorithm, extractor, fused, buffer = KINDS[kind]
     model = algorithm(
         FlockPolicy,
@@ -48,9 +48,9 @@ def learner(kind, env):
 
 
 def test_updates(benchmark):
-    """Rounds of updates of each kind in turn, so that whatever else the machine does falls on all of them."""
+    """Rounds of updates of each kind in turn, so that other load of the machine affects all of them."""
     env = make_vec_env(CONFIG.training_scenarios()[0], 8, seed=0)
-    models = {kind: learner(kind, env) for kind in KINDS}
+    models = {kind: untrained_model(kind, env) for kind in KINDS}
     seconds = {kind: [] for kind in KINDS}
 
     def one_round():
@@ -64,15 +64,15 @@ def test_updates(benchmark):
     if benchmark.disabled:
         return
     for kind, spent in times.items():
-        ratios = np.percentile(times["stock"] / spent, [10, 50, 90])
+        ratios = np.percentile(times["sb3"] / spent, [10, 50, 90])
         benchmark.extra_info[kind] = {
             "updates_per_second": UPDATES / float(np.median(spent)),
-            "times_stock": dict(zip(("p10", "median", "p90"), ratios.tolist(), strict=True)),
+            "times_sb3": dict(zip(("p10", "median", "p90"), ratios.tolist(), strict=True)),
         }
 
 
-def test_where_a_second_of_training_goes(benchmark, tmp_path, monkeypatch):
-    """Shares of ``sb3-flock train``'s time, evaluations as often as it has them."""
+def test_profile_of_a_training(benchmark, tmp_path, monkeypatch):
+    """Shares of the time of ``sb3-flock train``, with its frequency of evaluations."""
     spent = {}
 
     def timed(owner, name, key):
@@ -88,12 +88,12 @@ def test_where_a_second_of_training_goes(benchmark, tmp_path, monkeypatch):
         monkeypatch.setattr(owner, name, call)
 
     from sb3_flock.envs.vec_env import ParameterSharingVecEnv
-    from sb3_flock.rl import training
+    from sb3_flock.training.eval_callback import FlockEvalCallback
 
     timed(FlockDDPG, "train", "updates")
     timed(CompactReplayBuffer, "sample", "updates: sampling the replay buffer")
     timed(ParameterSharingVecEnv, "step_wait", "environment, SuperSuit included")
-    timed(training.Evaluation, "_evaluate", "evaluation")
+    timed(FlockEvalCallback, "_evaluate", "evaluation")
     timed(CompactReplayBuffer, "add", "replay buffer, storing")
     short = 20 * 32 if benchmark.disabled else 20_000
     config = CONFIG.replace(total_timesteps=short, output_dir=str(tmp_path), eval_freq=10_000, save_freq=0)
@@ -118,11 +118,11 @@ def test_a_thousand_episodes(benchmark):
 
 @pytest.mark.parametrize("name", ["iddpg", "maddpg", "sbx"])
 def test_peers_in_training(benchmark, peer, tmp_path, name):
-    """Ours and a peer one after the other: 5 agents, 8 flocks, the same batch and update ratio; see the peer's script."""
+    """The package and a peer in turn: 5 agents, 8 flocks, the same batch and update-to-data ratio; see the peer's script."""
     seconds, updates = [], []
     config = CONFIG.replace(
         total_timesteps=16_000, output_dir=str(tmp_path), eval_freq=0, save_freq=0,
-        train_env=CONFIG.train_env.replace(vehicles=5),
+        train_env=CONFIG.train_env.replace(flock_sizes=5),
         algorithm=CONFIG.algorithm.replace(learning_starts=200),
     )  # fmt: skip
 
@@ -132,14 +132,14 @@ def test_peers_in_training(benchmark, peer, tmp_path, name):
         seconds.append(time.perf_counter() - start)
 
     benchmark.pedantic(run, rounds=1)
-    theirs = peer(
+    result = peer(
         "training.py", name, "--vehicles", 5, "--flocks", 8, "--batch", config.algorithm.batch_size,
-        "--update-ratio", config.algorithm.utd_ratio, "--seconds", 60,
+        "--utd-ratio", config.algorithm.utd_ratio, "--seconds", 60,
     )  # fmt: skip
-    ours = {
+    own = {
         "env_steps_per_second": config.total_timesteps / seconds[-1],
         "updates_per_second": updates[-1] / seconds[-1],
     }
-    benchmark.extra_info |= {"ours": ours, name: theirs}
-    for key, value in ours.items():
-        benchmark.extra_info[f"times_{name}: {key}"] = value / theirs[key]
+    benchmark.extra_info |= {"sb3_flock": own, name: result}
+    for key, value in own.items():
+        benchmark.extra_info[f"times_{name}: {key}"] = value / result[key]

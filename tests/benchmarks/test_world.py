@@ -1,6 +1,6 @@
-"""The world's speed: dynamics, graph, tensor, reward and mix, one core.
+"""The speed of the world on one core: dynamics, proximity graph, observation, reward and mix.
 
-The flocks fly as a trained policy flies them: together and settled, by the actions it chose beforehand.
+The flocks are in the steady state of a trained policy, which chose their actions beforehand.
 """
 
 import numpy as np
@@ -12,7 +12,8 @@ from sb3_flock.sim import episode_rng, mix_rewards, observe, own_reward, reward_
 from sb3_flock.sim.backend import compiled
 from tests.benchmarks.conftest import POLICY
 
-SETTLED, STEPS = 120, 40
+STEADY_STATE, STEPS = 120, 40
+"""Steps before the measurement, and steps measured."""
 
 
 def advance(world, actions):
@@ -20,7 +21,7 @@ def advance(world, actions):
     scenario = world.scenario
     sensed, clipped = world.step(actions)
     observe(sensed, scenario)
-    rewards = own_reward(reward_terms(sensed, clipped, scenario))
+    rewards = own_reward(reward_terms(sensed, clipped, scenario.reward, scenario))
     mix_rewards(rewards, sensed.neighbors.observers, sensed.neighbors.vehicles, scenario.reward.lambda_)
 
 
@@ -39,19 +40,19 @@ def test_vehicle_steps(benchmark, peer_of_world, monkeypatch, n_flocks, kind):
     policy = load_policy(POLICY)
     controller, world = PolicyController(policy), World(policy.scenario, n_flocks)
     sensed = world.reset([episode_rng(0, episode) for episode in range(n_flocks)])
-    for _ in range(SETTLED):
+    for _ in range(STEADY_STATE):
         sensed, _ = world.step(controller.act(sensed, policy.scenario))
     start, actions = dict(vars(world)), []
     for _ in range(STEPS):
         actions.append(controller.act(sensed, policy.scenario))
         sensed, _ = world.step(actions[-1])
 
-    def fly():
+    def run():
         vars(world).update(start)
         for action in actions:
             advance(world, action)
 
-    benchmark.pedantic(fly, rounds=15, warmup_rounds=2)
+    benchmark.pedantic(run, rounds=15, warmup_rounds=2)
     if benchmark.disabled:
         return
     vehicle_steps = n_flocks * policy.scenario.n_vehicles * STEPS
@@ -59,7 +60,8 @@ def test_vehicle_steps(benchmark, peer_of_world, monkeypatch, n_flocks, kind):
     benchmark.extra_info |= {
         "vehicle_steps_per_second": speed,
         "neighbors": float(sensed.neighbors.count().mean()),
-        "bytes_of_tensor_per_vehicle_step": int(np.prod(policy.scenario.observation_shape)) * np.dtype(np.float32).itemsize,
+        "bytes_of_observation_per_vehicle_step": int(np.prod(policy.scenario.observation_shape))
+        * np.dtype(np.float32).itemsize,
     }
     peer_of_world(benchmark, speed, "vmas", n_flocks, 5, 2)
 
@@ -92,21 +94,21 @@ def test_seconds_per_step_of_one_crowd(benchmark, peer_of_world, n_vehicles):
 
 @pytest.fixture
 def peer_of_world(request):
-    """Measure a peer on the same numbers of flocks, vehicles and obstacles and note it beside ours."""
+    """A function that measures a peer on the same numbers of flocks, vehicles and obstacles and records the result."""
 
     def compare(benchmark, speed, name, flocks, vehicles, obstacles):
         try:
             measure = request.getfixturevalue("peer")
         except pytest.skip.Exception:
-            return  # ours alone
+            return  # this package alone
         size = ("--flocks", flocks, "--obstacles", obstacles) if name == "vmas" else ()  # MPE2 has one world, no obstacles
-        theirs = measure("worlds.py", name, "--vehicles", vehicles, *size, "--seconds", 3)
-        benchmark.extra_info[name] = theirs
-        benchmark.extra_info[f"times_{name}"] = speed / theirs["vehicle_steps_per_second"]
+        result = measure("worlds.py", name, "--vehicles", vehicles, *size, "--seconds", 3)
+        benchmark.extra_info[name] = result
+        benchmark.extra_info[f"times_{name}"] = speed / result["vehicle_steps_per_second"]
 
     return compare
 
 
-def test_the_plain_path_is_the_one_that_is_measured_as_plain(monkeypatch):
+def test_the_numpy_path_is_measured_without_numba(monkeypatch):
     without_numba(monkeypatch)
     assert sensing.compiled() is None

@@ -1,9 +1,9 @@
-"""Minutes from nothing to the figures of the paper's Table II: ``python tests/benchmarks/time_to_paper.py``.
+"""Minutes until a training meets the paper's Table II: ``python tests/benchmarks/time_to_paper.py``.
 
-Trains (3, 1) and (5, 2) with the default recipe, one torch thread each, and stops a training as soon as an evaluation holds
-every column of Table II, first on the evaluation's own episodes and then on 1000 further ones. The clock runs from the start
-of the process, imports, compilation and evaluations included. At last the policy flies the 1000 episodes of the result tables,
-which nothing was chosen by. Prints a line a training and a JSON object.
+Trains (3, 1) and (5, 2) with the default config, one torch thread each. A training stops as soon as its policy meets every
+column of Table II on the episodes of an evaluation and on 1000 further ones. The time starts with the process and includes
+imports, compilation and evaluations. The final test is on the 1000 episodes of the result tables, which no choice depends on.
+Prints a JSON object for each training, and the median of each task.
 """
 
 from __future__ import annotations
@@ -22,12 +22,15 @@ CONFIRMATION_SEED = 2_000_000
 
 
 def holds(means: dict[str, float], paper: dict[str, float]) -> bool:
-    """Whether every column is at least as good: errors and separations of the pack small, minima large."""
+    """Whether every column is at least as good: the minima not smaller, everything else not larger."""
     return all(means[name] >= bound if name.startswith("min_") else means[name] <= bound for name, bound in paper.items())
 
 
 def train_until_it_holds(n_vehicles: int, n_obstacles: int, seed: int, changes: list[str]) -> dict[str, object]:
-    """One training in this process; ``changes`` of the config as on the command line."""
+    """One training in this process.
+
+    :param changes: ``key=value`` overrides of the config
+    """
     import numpy as np
     from rich.console import Console
     from stable_baselines3.common.callbacks import BaseCallback
@@ -39,7 +42,7 @@ def train_until_it_holds(n_vehicles: int, n_obstacles: int, seed: int, changes: 
     paper = PAPER[n_vehicles, n_obstacles]["Table II"]
 
     class Stop(BaseCallback):
-        """Ends the training once the last evaluation and 1000 further episodes hold."""
+        """Ends the training when the last evaluation and 1000 further episodes meet Table II."""
 
         at: float | None = None
         seen = 0
@@ -71,7 +74,7 @@ def train_until_it_holds(n_vehicles: int, n_obstacles: int, seed: int, changes: 
 
 
 def main() -> None:
-    """Every training in a process of its own, one after the other."""
+    """Run every training in a process of its own, one after the other."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="as for `sb3-flock train`")

@@ -1,6 +1,6 @@
-"""Search the gains of a hand-written controller, fairly: on the episodes that trainings choose their best model by.
+"""Search the gains of a baseline controller on the episodes by which trainings choose their best model.
 
-Random draws, each flown on (3, 1) and (5, 2); prints every draw that is better than all before, by the sum of the scores::
+The search evaluates random draws on (3, 1) and (5, 2), and prints every draw with a lower sum of scores than all before::
 
     python tests/benchmarks/tune_controllers.py orca --draws 200
 """
@@ -17,7 +17,7 @@ from sb3_flock import Scenario
 from sb3_flock.controllers.olfati_saber import OlfatiGains, OlfatiSaber
 from sb3_flock.controllers.orca import Orca, OrcaGains
 from sb3_flock.evaluation.metrics import score
-from sb3_flock.evaluation.rollout import fly
+from sb3_flock.evaluation.rollout import rollout
 from sb3_flock.training.eval_callback import SELECTION_SEED
 
 RANGES: dict[str, tuple[Any, Any, dict[str, tuple[float, float]]]] = {
@@ -44,18 +44,18 @@ RANGES: dict[str, tuple[Any, Any, dict[str, tuple[float, float]]]] = {
 SCENARIOS = (Scenario(n_vehicles=3, n_obstacles=1), Scenario(n_vehicles=5, n_obstacles=2))
 
 
-def judge(controller: Any, episodes: int) -> tuple[float, list[dict[str, float]]]:
+def evaluate(controller: Any, episodes: int) -> tuple[float, list[dict[str, float]]]:
     """The sum of the scores, and the mean metrics of each scenario."""
     means = []
     for scenario in SCENARIOS:
-        values = fly(controller, scenario, episodes, SELECTION_SEED)
+        values = rollout(controller, scenario, episodes, SELECTION_SEED)
         means.append({name: float(np.nanmean(value)) for name, value in values.items() if not np.isnan(value).all()})
     return sum(map(score, means)), means
 
 
 def main() -> None:
-    """Search as the command line says."""
-    parser = argparse.ArgumentParser(description="Search the gains of a hand-written controller.")
+    """Search with the options of the command line."""
+    parser = argparse.ArgumentParser(description="Search the gains of a baseline controller.")
     parser.add_argument("controller", choices=RANGES)
     parser.add_argument("--draws", type=int, default=200)
     parser.add_argument("--episodes", type=int, default=100)
@@ -72,7 +72,7 @@ def main() -> None:
             gains = gains_class(**{name: float(np.clip(near[name], *bounds)) for name, bounds in ranges.items()})
         elif draw:
             gains = gains_class(**{name: float(np.exp(rng.uniform(*np.log(bounds)))) for name, bounds in ranges.items()})
-        total, means = judge(controller(gains), args.episodes)
+        total, means = evaluate(controller(gains), args.episodes)
         if total < best:
             best, best_gains = total, gains
             columns = ("tracking_error", "neighbor_violation_rate", "obstacle_violation_rate", "connectivity")

@@ -1,4 +1,4 @@
-"""Rankings against what can be worked out by hand."""
+"""Rankings against values worked out by hand."""
 
 import csv
 import io
@@ -30,31 +30,31 @@ def test_less_error_and_more_connectivity_are_better(metric, best):
     first, second = rank(config, trials_of(config, one_metric(metric, *values)), metric)
     assert first.name == best
     by_name = {setting.name: setting for setting in (first, second)}
-    assert by_name["gamma 0.9"].mean == pytest.approx(0.115)  # of four runs the best and the worst are left out
-    assert by_name["gamma 0.99"].mean == pytest.approx(0.215)
-    assert np.isnan(first.beaten)
+    assert by_name["gamma 0.9"].iqm == pytest.approx(0.115)  # of four runs the best and the worst are left out
+    assert by_name["gamma 0.99"].iqm == pytest.approx(0.215)
+    assert np.isnan(first.p_best_better)
     wins = {"tracking_error": 12 / 16, "connectivity": 12 / 16}[metric]  # of all pairs of runs
-    assert second.beaten == pytest.approx(wins)
+    assert second.p_best_better == pytest.approx(wins)
     for setting in (first, second):
-        assert setting.low <= setting.mean <= setting.high
+        assert setting.low <= setting.iqm <= setting.high
         assert setting.values.min() <= setting.low
         assert setting.high <= setting.values.max()
 
 
-def test_runs_that_were_lost_are_counted_and_left_out_of_every_task():
+def test_lost_runs_are_counted_and_left_out_of_every_task():
     config = load_sweep("", text="grid: {gamma: [0.9], n_vehicles: [3, 5], seed: [0, 1, 2]}\ntasks: [n_vehicles]")
     (setting,) = rank(config, trials_of(config, one_metric("score", 1.0, None, 3.0, 5.0, 6.0, 7.0)), "score")
     np.testing.assert_array_equal(setting.values, [[1.0, 5.0], [3.0, 7.0]])  # (runs, tasks), without seed 1
     assert setting.lost == 1
-    assert setting.mean == pytest.approx(4.0)
+    assert setting.iqm == pytest.approx(4.0)
 
 
-def test_a_sweep_of_which_nothing_is_left_ranks_nothing():
+def test_a_sweep_without_a_finished_trial_has_no_ranking():
     config = load_sweep("", text="grid: {seed: [0, 1]}")
     assert rank(config, trials_of(config, [None, None]), "score") == []
 
 
-def test_table_csv_and_picture_hold_every_setting():
+def test_table_csv_and_figure_hold_every_setting():
     config = load_sweep("", text="grid: {lambda_: [0, 0.5, 1], seed: [0, 1, 2]}")
     settings = rank(config, trials_of(config, one_metric("score", *np.arange(9.0))), "score")
     console = quiet()

@@ -1,17 +1,20 @@
-"""Real sweeps by the command line: on one machine, on a cluster of two nodes, through kills."""
+"""Whole sweeps by the command line: on one machine, on a cluster of two nodes, with kills."""
 
 import csv
+import io
 import os
 import signal
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import pytest
 import torch as th
 
 from sb3_flock import load_policy, train
 from sb3_flock.sweep.config import load_sweep
+from sb3_flock.sweep.run import Folder, _as_csv, _ended
 from tests.helpers import TINY, quiet
 
 pytest.importorskip("ray")
@@ -23,7 +26,7 @@ LONG = {**SMALL, "total_timesteps": 4_000, "save_freq": 500, "eval_freq": 2_000,
 
 @pytest.fixture(autouse=True)
 def _not_nice(monkeypatch):
-    """Beside other tests Ray's workers, nice by default, would hardly get a core."""
+    """Ray's workers are nice by default, and would hardly get a core beside other tests."""
     monkeypatch.setenv("RAY_worker_niceness", "0")
 
 
@@ -69,13 +72,13 @@ def assert_the_same_as_trained_alone(file, out, tmp_path):
     for point in config.points():
         row = rows[point["seed"]]
         alone = train(config.training(point).replace(output_dir=str(tmp_path / "alone")), quiet())
-        flown = load_policy(out / row["run"] / "final_model.zip").policy.state_dict()
+        swept = load_policy(out / row["run"] / "final_model.zip").policy.state_dict()
         for name, tensor in alone.model.policy.state_dict().items():
-            assert th.equal(tensor, flown[name]), (point, name)
+            assert th.equal(tensor, swept[name]), (point, name)
 
 
-def test_a_grid_leaves_run_folders_a_table_and_a_ranking_and_survives_what_diverges(tmp_path):
-    """In a storage that Ray reaches through fsspec alone."""
+def test_a_grid_writes_run_folders_a_table_and_a_ranking_and_survives_diverging_trials(tmp_path):
+    """The storage is one that Ray reaches through fsspec alone."""
     file = sweep_file(tmp_path, f"base: {SMALL}\ngrid: {{learning_rate: [0.0005, 1000000.0], seed: [0, 1]}}\n")
     out = tmp_path / "out"
     code, output, errors = Sweep(file, "--out", f"local://{out}", "--set", "total_timesteps=420").end()
@@ -97,11 +100,11 @@ def test_a_grid_leaves_run_folders_a_table_and_a_ranking_and_survives_what_diver
 
     code, _, errors = Sweep(file, "--out", f"local://{out}").end()
     assert code == 2
-    assert "it exists already; to go on with a sweep: sb3-flock sweep --resume" in errors
+    assert f"out = local://{out}: exists already; resume local://{out} to continue a sweep" in errors
 
 
 @pytest.mark.slow
-def test_a_killed_driver_goes_on_to_the_same_policies(tmp_path):
+def test_a_sweep_with_a_killed_driver_resumes_to_the_same_policies(tmp_path):
     file, out = sweep_file(tmp_path, f"base: {LONG}\ngrid: {{seed: [0, 1]}}\n"), tmp_path / "out"
     first = Sweep(file, "--out", out)
     first.wait_for_checkpoints(out, 2)
@@ -119,7 +122,7 @@ def test_a_killed_driver_goes_on_to_the_same_policies(tmp_path):
     assert results(out) == rows
 
 
-def test_a_killed_node_s_trial_goes_on_on_the_other(tmp_path):
+def test_the_trial_of_a_killed_node_resumes_on_the_other_node(tmp_path):
     from ray.cluster_utils import Cluster
 
     file, out = sweep_file(tmp_path, f"base: {LONG}\ngrid: {{seed: [0, 1]}}\n"), tmp_path / "out"
@@ -130,31 +133,32 @@ def test_a_killed_node_s_trial_goes_on_on_the_other(tmp_path):
         run.wait_for_checkpoints(out, 2)
         raylet = str(node.all_processes["raylet"][0].process.pid)
         workers = subprocess.run(["pgrep", "-P", raylet], capture_output=True, text=True, check=True).stdout.split()
-        for pid in (raylet, *workers):  # a worker would go on for a while without it
+        for pid in (raylet, *workers):  # a worker would run for a while without its raylet
             os.kill(int(pid), signal.SIGKILL)
         code, _, errors = run.end()
     finally:
         cluster.shutdown()
     assert code == 0, errors
-    assert errors.count("lost; goes on from its last checkpoint") == 1
+    assert errors.count("lost; resumes from its last checkpoint") == 1
     commands = [(out / row["run"] / "command.txt").read_text() for row in results(out)]
     assert sorted(command.count("--resume") for command in commands) == [0, 1]
     assert_the_same_as_trained_alone(file, out, tmp_path)
 
 
 @pytest.mark.slow
-def test_an_interrupted_sweep_says_how_to_go_on(tmp_path):
+def test_an_interrupted_sweep_says_how_to_resume(tmp_path):
     file, out = sweep_file(tmp_path, f"base: {LONG}\ngrid: {{seed: [0, 1, 2]}}\n"), tmp_path / "out"
     run = Sweep(file, "--out", out)
     run.wait_for_checkpoints(out, 1)
     run.process.send_signal(signal.SIGINT)
     code, _, errors = run.end()
     assert code == 130
-    assert errors.splitlines()[-1].endswith(f"trials did not end; to go on: sb3-flock sweep --resume {out}")
+    assert "trials did not end" in errors.splitlines()[-1]
+    assert errors.splitlines()[-1].endswith(f"sb3-flock sweep --resume {out}")
     assert {row["status"] for row in results(out)} <= {"unfinished", "done"}
 
 
-def test_a_search_ends_with_its_best(tmp_path):
+def test_a_search_prints_its_best_trials(tmp_path):
     space = "{learning_rate: {low: 0.0001, high: 0.01, log: true}, batch_size: {low: 8, high: 32}, gamma: [0.9, 0.96]}"
     file, out = sweep_file(tmp_path, f"base: {SMALL}\nsearch: {space}\ntrials: 2\n"), tmp_path / "out"
     code, output, errors = Sweep(file, "--out", out).end()
@@ -166,7 +170,7 @@ def test_a_search_ends_with_its_best(tmp_path):
     assert "learning_rate" in output
 
 
-def test_a_policy_flies_over_a_grid_as_it_does_in_evaluate(tmp_path):
+def test_a_policy_over_a_grid_has_the_metrics_of_evaluate(tmp_path):
     from sb3_flock import evaluate
 
     file, out = sweep_file(tmp_path, "grid: {n_vehicles: [1, 4], seed: [3]}\n"), tmp_path / "out"
@@ -180,34 +184,48 @@ def test_a_policy_flies_over_a_grid_as_it_does_in_evaluate(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "message"),
     [
         (["--set", "n_vehicles=-1"], "n_vehicles = -1: input should be greater than or equal to 1"),
-        (["--address", "127.0.0.1:9"], "--address 127.0.0.1:9: no Ray cluster answers there"),
-        (["--address", "nowhere"], "--address nowhere: no Ray cluster answers there"),
-        (["--out", "strange://x"], "--out strange://x: Protocol not known: strange"),
+        (["--address", "127.0.0.1:9"], "address = 127.0.0.1:9: no Ray cluster answers there"),
+        (["--address", "nowhere"], "address = nowhere: no Ray cluster answers there"),
+        (["--out", "strange://x"], "out = strange://x: Protocol not known: strange"),
         (["--evaluate", "nobody"], "nobody: no such file or run folder"),
         (
             ["--evaluate", "general", "--set", "n_anchors=7"],
-            "general.zip: it sees tensors of (6, 11, 11), but the scenario's (n_anchors = 7, motion_lag = 0.2) are of (6, 7, 7)",
+            "general.zip: its observations have the shape (6, 11, 11), the scenario's (n_anchors = 7, motion_lag = 0.2) have "
+            "(6, 7, 7)",
         ),
-        (["--evaluate", "general", "--set", "gamma=0.5"], "algorithm.gamma does not tell on a flight"),
+        (["--evaluate", "general", "--set", "gamma=0.5"], "algorithm.gamma does not affect an evaluation"),
         (["--episodes", "3"], "--episodes 3: only with --evaluate"),
         (["--resume", "x"], "a FILE or --resume DIR is needed, and not both"),
     ],
 )
-def test_a_mistake_is_one_line_and_leaves_nothing(words, told, tmp_path, monkeypatch, capsys):
+def test_a_mistake_is_one_line_and_leaves_no_file(words, message, tmp_path, monkeypatch, capsys):
     from sb3_flock.cli import main
 
     monkeypatch.chdir(tmp_path)
     assert main(["sweep", str(sweep_file(tmp_path, "grid: {seed: [0, 1]}\n")), *words]) == 2
     errors = capsys.readouterr().err
-    assert told in errors
+    assert message in errors
     assert errors.count("\n") == 1
     assert [path.name for path in tmp_path.iterdir()] == ["mine.yaml"]
 
 
-def test_more_than_the_machine_has_is_refused(tmp_path):
+def test_a_trial_of_the_previous_release_has_todays_names(tmp_path):
+    """Ray's state keeps each trial's point under the names of its release; the grid of the sweep has today's."""
+    config = load_sweep("", text="grid: {train_env.flock_sizes: [[3]], algorithm.action_noise_std: [0.2]}")
+    report = {"status": "done", "timesteps": 300, "test": {"tracking_error": 0.1}}
+    kept = SimpleNamespace(
+        config={"practice.vehicles": [3], "learner.noise": 0.2}, last_result=report, status="TERMINATED", checkpoint=None
+    )
+    trial = _ended(kept, Folder(str(tmp_path)))
+    assert set(trial.point) == set(config.grid)
+    (row,) = csv.DictReader(io.StringIO(_as_csv(config, [trial])))
+    assert (row["train_env.flock_sizes"], row["algorithm.action_noise_std"], row["tracking_error"]) == ("[3]", "0.2", "0.1")
+
+
+def test_more_resources_than_the_machine_has_are_refused(tmp_path):
     file = sweep_file(tmp_path, "grid: {seed: [0, 1]}\nresources: {cpus: 1024}\n")
     code, _, errors = Sweep(file, "--out", tmp_path / "out").end()
     assert code == 2

@@ -1,9 +1,9 @@
-"""How fast other libraries train DDPG: transitions and updates per second, flying included, on one CPU thread.
+"""How fast other libraries train DDPG: transitions and updates per second, simulation included, on one CPU thread.
 
 Run by the Python of the peers' own environment (requirements.txt beside this file, and sb3_flock itself); prints one line of
 JSON::
 
-    python training.py iddpg --vehicles 5 --flocks 8 --batch 128 --update-ratio 0.2 --seconds 60
+    python training.py iddpg --vehicles 5 --flocks 8 --batch 128 --utd-ratio 0.2 --seconds 60
 
 ``iddpg`` and ``maddpg`` are BenchMARL's, on its VMAS flocking task: DDPG with one policy for all agents, whose critic sees
 one agent or all of them. ``sbx`` is the DDPG of SBX (JAX) on sb3_flock's own vector env. A transition is one step of one
@@ -30,9 +30,9 @@ BUFFER = 250_000
 LEARNING_RATE = 5e-4
 GAMMA = 0.98
 ROUND = 20
-"""Vector steps between BenchMARL's rounds of updates: it is built to collect many and then to update many times."""
+"""Vector steps between BenchMARL's rounds of updates: BenchMARL collects many and then updates many times."""
 WARM_UP = 1600
-"""Transitions flown and learned from before the clock starts; compiles what SBX compiles."""
+"""Transitions before the clock starts, with updates; SBX compiles in this time."""
 
 
 class Done(Exception):  # noqa: N818 - no error
@@ -40,7 +40,7 @@ class Done(Exception):  # noqa: N818 - no error
 
 
 class Stopwatch:
-    """Starts when the warm-up is over and raises :class:`Done` when the given seconds are."""
+    """Starts at the end of the warm-up and raises :class:`Done` after the given seconds."""
 
     def __init__(self, seconds: float) -> None:
         self.seconds = seconds
@@ -66,7 +66,7 @@ class Stopwatch:
 
 
 def train_benchmarl(algorithm: str, args: argparse.Namespace, stopwatch: Stopwatch) -> dict[str, Any]:
-    """BenchMARL's IDDPG or MADDPG on VMAS's flocking; what to print of it."""
+    """BenchMARL's IDDPG or MADDPG on VMAS's flocking; returns the description of the setup."""
     import torch
     from benchmarl.algorithms import IddpgConfig, MaddpgConfig
     from benchmarl.environments import VmasTask
@@ -76,7 +76,7 @@ def train_benchmarl(algorithm: str, args: argparse.Namespace, stopwatch: Stopwat
     torch.set_num_threads(1)
 
     class Count(Callback):
-        """Counts optimizer steps, and frames once they are learned from."""
+        """Counts optimizer steps, and frames after their updates."""
 
         def __init__(self) -> None:
             super().__init__()
@@ -123,17 +123,17 @@ def train_benchmarl(algorithm: str, args: argparse.Namespace, stopwatch: Stopwat
         experiment.callbacks.append(count)
         with contextlib.suppress(Done):
             experiment.run()
-    sees = "each agent's own observation and action" if algorithm == "iddpg" else "all agents' observations and actions"
+    inputs = "each agent's own observation and action" if algorithm == "iddpg" else "all agents' observations and actions"
     return {
         "batch": frames_per_batch * args.vehicles,
         "observation_size": experiment.observation_spec["agents", "observation"].shape[-1],
-        "network": f"MLP {NET_ARCH} of VMAS's observation, shared policy, one shared critic of {sees}",
+        "network": f"MLP {NET_ARCH} of VMAS's observation, shared policy, one shared critic of {inputs}",
         "versions": {name: version(name) for name in ("benchmarl", "torchrl", "tensordict", "vmas", "torch")},
     }
 
 
 def train_sbx(args: argparse.Namespace, stopwatch: Stopwatch) -> dict[str, Any]:
-    """SBX's DDPG on sb3_flock's vector env; what to print of it."""
+    """SBX's DDPG on sb3_flock's vector env; returns the description of the setup."""
     import numpy as np
     from sbx import DDPG
     from stable_baselines3.common.callbacks import BaseCallback
@@ -142,7 +142,7 @@ def train_sbx(args: argparse.Namespace, stopwatch: Stopwatch) -> dict[str, Any]:
     from sb3_flock import Scenario, make_vec_env
 
     class Watch(BaseCallback):
-        """Looks at the stopwatch between updates and the next vector step."""
+        """Reads the stopwatch between the updates and the next vector step."""
 
         def _on_step(self) -> bool:
             return True
@@ -153,7 +153,7 @@ def train_sbx(args: argparse.Namespace, stopwatch: Stopwatch) -> dict[str, Any]:
     scenario = Scenario(n_vehicles=args.vehicles, n_obstacles=N_OBSTACLES, max_cycles=EPISODE)
     env = make_vec_env(scenario, n_flocks=args.flocks, seed=0)
     model = DDPG(
-        "MlpPolicy",  # flattens the tensor
+        "MlpPolicy",  # flattens the observation
         env,
         learning_rate=LEARNING_RATE,
         qf_learning_rate=LEARNING_RATE,
@@ -173,7 +173,7 @@ def train_sbx(args: argparse.Namespace, stopwatch: Stopwatch) -> dict[str, Any]:
     return {
         "batch": args.batch,
         "observation_size": int(np.prod(scenario.observation_shape)),
-        "network": f"MLP {NET_ARCH} of the flattened tensor, no convolutions, one critic",
+        "network": f"MLP {NET_ARCH} of the flattened observation, no convolutions, one critic",
         "versions": {name: version(name) for name in ("sbx-rl", "jax", "flax", "stable-baselines3", "sb3_flock")},
     }
 
@@ -185,7 +185,7 @@ def main() -> None:
     parser.add_argument("--vehicles", type=int, default=5)
     parser.add_argument("--flocks", type=int, default=8)
     parser.add_argument("--batch", type=int, default=128, help="transitions in a minibatch")
-    parser.add_argument("--update-ratio", type=float, default=0.2, help="updates for each transition")
+    parser.add_argument("--utd-ratio", type=float, default=0.2, help="updates for each transition")
     parser.add_argument("--seconds", type=float, default=60.0)
     args = parser.parse_args()
 
@@ -194,8 +194,8 @@ def main() -> None:
     os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false"
     stopwatch = Stopwatch(args.seconds)
     with contextlib.redirect_stdout(sys.stderr):  # BenchMARL prints that it was stopped
-        about = train_sbx(args, stopwatch) if args.peer == "sbx" else train_benchmarl(args.peer, args, stopwatch)
-    print(json.dumps({"peer": args.peer, "flocks": args.flocks, "vehicles": args.vehicles, **about, **stopwatch.result}))
+        setup = train_sbx(args, stopwatch) if args.peer == "sbx" else train_benchmarl(args.peer, args, stopwatch)
+    print(json.dumps({"peer": args.peer, "flocks": args.flocks, "vehicles": args.vehicles, **setup, **stopwatch.result}))
 
 
 if __name__ == "__main__":

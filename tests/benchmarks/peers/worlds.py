@@ -1,4 +1,4 @@
-"""How fast other multi-agent simulators fly: steps of their worlds on one CPU thread, observations and rewards included.
+"""How fast other multi-agent simulators are: steps of their worlds on one CPU thread, observations and rewards included.
 
 Run by the Python of the peers' own environment (requirements.txt beside this file); prints one line of JSON::
 
@@ -51,7 +51,7 @@ def vmas_world(flocks: int, vehicles: int, obstacles: int) -> tuple[Callable[[],
 
     def step() -> None:
         _, _, dones, _ = env.step(next(actions))
-        if dones[0]:  # the flocks start together and are only ended by the time limit
+        if dones[0]:  # the flocks start together, and only the time limit ends them
             env.reset()
 
     return step, observation_size
@@ -80,15 +80,15 @@ def mpe2_world(vehicles: int) -> tuple[Callable[[], None], int]:
 def seconds_per_step(step: Callable[[], None], seconds: float) -> float:
     """Median over equal slices of the time measured, after a warm-up."""
 
-    def fly(duration: float) -> float:
+    def run(duration: float) -> float:
         start, steps = time.perf_counter(), 0
         while (elapsed := time.perf_counter() - start) < duration:
             step()
             steps += 1
         return elapsed / steps
 
-    fly(WARM_UP * seconds)
-    return statistics.median(fly(seconds / SLICES) for _ in range(SLICES))
+    run(WARM_UP * seconds)
+    return statistics.median(run(seconds / SLICES) for _ in range(SLICES))
 
 
 def main() -> None:
