@@ -89,7 +89,7 @@ def reproduce(out: str | Path, quick: bool = False, console: Console | None = No
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise SettingsError(f"--out {out}: {error.strerror or error}") from None
+        raise SettingsError(f"{out}: {error.strerror or error}") from None
     policies = {name: load_policy(name) for name in shipped_policies()}
     ours = {name: {label: policies[own] for label, own in _ours(name).items()} for name in SETTINGS}
     parts = [_head(size)]
