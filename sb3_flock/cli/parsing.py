@@ -36,7 +36,7 @@ class Parser(argparse.ArgumentParser):
         self.flags += action.option_strings
         return action
 
-    def add_set(self, example: str, settings: type[Settings]) -> None:
+    def add_set(self, example: str, settings: type[Settings], which: str = "them all") -> None:
         """Add ``--set`` for the fields of a settings class."""
         self.fields += [".".join(path) for path in leaf_paths(settings)]
         self.add_argument(
@@ -44,7 +44,7 @@ class Parser(argparse.ArgumentParser):
             action="append",
             default=[],
             metavar="KEY=VALUE",
-            help=f"change any other field, such as {example}; `sb3-flock config` lists them all",
+            help=f"change any other field, such as {example}; `sb3-flock config` lists {which}",
         )
 
     def parse_known_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> Any:  # type: ignore[override]

@@ -45,7 +45,7 @@ def add_rollout(parser: Parser) -> None:
     parser.add_argument("--seed", type=count(0), default=0, metavar="N", help="seed of the episodes [0]")
     parser.add_argument("--device", default="cpu", metavar="NAME", help="torch device [cpu]")
     add_trust(parser)
-    parser.add_set("obstacle_arena=0.5", Scenario)
+    parser.add_set("obstacle_arena=0.5", Scenario, "them all, under scenario")
 
 
 ROLLOUT_RENAMED = {"--scenario": "--obstacle-motion"}

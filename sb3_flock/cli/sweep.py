@@ -23,7 +23,7 @@ def add(commands: Any) -> None:
         "sweep",
         run,
         "configs/sweep_lambda.yaml --set total_timesteps=20000",
-        help="train or evaluate at many settings, on one machine or a Ray cluster",
+        help="train or evaluate at many settings, also on a Ray cluster",
         description="Train at every point of a grid or a search, as many at once as there are cores; rank the settings.",
         renamed={"--out": "--output"},
     )

@@ -35,7 +35,7 @@ def add(commands: Any) -> None:
         commands,
         "train",
         run,
-        "--n-vehicles 5 --n-obstacles 2 --set reward.lambda_=0.5",
+        "--n-vehicles 5 --set reward.lambda_=0.5",
         help="train a policy",
         description="Train one shared policy and leave a run folder.",
         renamed=RENAMED,
@@ -43,8 +43,8 @@ def add(commands: Any) -> None:
     parser.add_argument(
         "--resume",
         metavar="RUN",
-        help="continue this run folder from its newest whole checkpoint; of the other flags only those that leave alone "
-        "what is learned are accepted, and a larger --total-timesteps",
+        help="continue this run folder from its newest whole checkpoint; accepts a larger --total-timesteps, and otherwise "
+        "only flags that do not change what is learned",
     )
     add_config_flags(parser)
 
@@ -66,15 +66,14 @@ def _help(path: str) -> str:
     from sb3_flock.rl.registry import ALGORITHMS
 
     field = field_of(TrainingConfig, path)
-    text = field.description
+    text, _, null = (field.description or "").partition("; null: ")
     if path == "algo":
         text = f"learning algorithm: {listed(ALGORITHMS)}"
     elif path == "scenario.n_vehicles":
         sizes = listed(map(str, TrainEnvConfig().flock_sizes or ()))
-        text = f"{text}: the task's, for evaluation; the training env has flocks of {sizes} unless --set "
-        text += "train_env.flock_sizes=null"
-    default = "" if field.default is None else f" [{field.default}]"
-    return f"{text}{default}".replace("%", "%%")
+        text = f"number of vehicles of the task (paper: 3 or 5); the training env has flocks of {sizes}, unless "
+        text += "--set train_env.flock_sizes=null"
+    return f"{text} [{null if field.default is None else field.default}]".replace("%", "%%")
 
 
 def config_of(options: argparse.Namespace) -> Any:
