@@ -37,7 +37,7 @@ def run(options: argparse.Namespace, words: Sequence[str]) -> int:
     if options.name is None:
         console.print(_list())
         console.print(
-            "A task 5v2o has 5 vehicles and 2 obstacles. RL is reinforcement learning alone; RL + MPC also imitates the MPC "
+            "A task 5v2o has 5 vehicles and 2 obstacles. RL is reinforcement learning alone; RL+MPC also imitates the MPC "
             "expert.\n`sb3-flock policies NAME` shows a model card, `sb3-flock play NAME` the policy."
         )
     else:
@@ -59,23 +59,25 @@ def _known(name: str) -> str:
 
 def _list() -> Table:
     """A line for each policy; the metrics are of the training that was shipped."""
+    from rich.table import Table
+
     from sb3_flock.evaluation.metrics import columns
     from sb3_flock.evaluation.model_cards import read_card
-    from sb3_flock.evaluation.report import add_short_columns, plain_table, short_cells
+    from sb3_flock.evaluation.report import short_cells
     from sb3_flock.pretrained import shipped_policies
 
-    table = plain_table()
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
     for heading in ("name", "task", "method"):
         table.add_column(heading, no_wrap=True)
-    add_short_columns(table)
+    for metric in columns().values():
+        table.add_column(str(metric.column).replace(" ", "\n"), justify="right")
     table.add_column("size", justify="right", no_wrap=True)
     for name, path in shipped_policies().items():
         card = read_card(name)
         config = _config(card)
         scenario = config.scenario
         task = f"{scenario.n_vehicles}v{scenario.n_obstacles}o {scenario.obstacle_motion}"
-        means = {metric: value for metric, value in _shipped(card)["metrics"].items() if metric in columns()}
-        table.add_row(name, task, _method(config)[0], *short_cells(means), _size(path.stat().st_size))
+        table.add_row(name, task, _method(config)[0], *short_cells(_shipped(card)["metrics"]), _size(path.stat().st_size))
     return table
 
 
@@ -100,7 +102,7 @@ def _method(config: TrainingConfig) -> tuple[str, str]:
     words = f"reinforcement learning with an {name} expert, which drives {config.train_env.expert_fraction:.0%} of the episodes"
     if config.algorithm.bc_coef:
         words += f"; behavior cloning of its actions (weight {config.algorithm.bc_coef:g})"
-    return f"RL + {name}", words
+    return f"RL+{name}", words
 
 
 def _size(n_bytes: int) -> str:

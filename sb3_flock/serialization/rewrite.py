@@ -68,13 +68,17 @@ def rewrite(path: str | Path) -> bool:
 
 def _policy(path: Path) -> bytes | None:
     """The zip's bytes in the present format, or ``None`` if it has that already."""
-    loaded = load_policy(path)  # refuses everything that is damaged
-    with zipfile.ZipFile(path) as archive:
-        names = archive.namelist()
-        if _CHECKPOINT in names:
-            raise PolicyError(f"{path}: a checkpoint, which is migrated when its training is resumed")
-        if MEMBER not in names:
-            raise PolicyError(f"{path}: saved by SB3 alone, without a config that could be migrated")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = archive.namelist()
+    except (zipfile.BadZipFile, ValueError) as error:
+        raise PolicyError(f"{path}: damaged ({first_line(error)})") from None
+    if _CHECKPOINT in names:
+        raise PolicyError(f"{path}: a checkpoint, which is migrated when its training is resumed")
+    if MEMBER not in names:
+        raise PolicyError(f"{path}: saved by SB3 alone, without a config that could be migrated")
+    loaded = load_policy(path)  # checks the members that it reads
+    with zipfile.ZipFile(path) as archive, _damage_of(path):
         member = json.loads(read_member(archive, MEMBER, _MAX_JSON))
         number = member["format"]
         if number == FORMAT and not migrate_config(TrainingConfig, member["config"], number)[1]:
@@ -195,6 +199,15 @@ def _dump(values: Mapping[str, Any], text: str) -> bytes:
 def _leading_comments(text: str) -> str:
     lines = text.splitlines(keepends=True)
     return "".join(itertools.takewhile(lambda line: line.lstrip().startswith("#") or not line.strip(), lines))
+
+
+@contextmanager
+def _damage_of(path: Path) -> Iterator[None]:
+    """Whatever zipfile and json raise for a damaged file."""
+    try:
+        yield
+    except Exception as error:
+        raise PolicyError(f"{path}: damaged ({first_line(error)})") from None
 
 
 @contextmanager

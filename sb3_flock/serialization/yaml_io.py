@@ -5,6 +5,7 @@ A file may hold any part of a config: fields that it leaves out keep their defau
 
 from __future__ import annotations
 
+import math
 import re
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
@@ -21,12 +22,21 @@ _Settings = TypeVar("_Settings", bound=Settings)
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML's safe loader, which also reads 1e-3 as a number; in YAML 1.1 it is a string."""
+    """YAML's safe loader, which also reads 1e-3 as a number and 1e5 as an integer; in YAML 1.1 they are strings."""
 
 
 _Loader.add_implicit_resolver(
     "tag:yaml.org,2002:float", re.compile(r"^[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]+$"), list("-+.0123456789")
 )
+_WHOLE = re.compile(r"[-+]?[0-9]+[eE]\+?[0-9]+")
+
+
+def _read_float(loader: _Loader, node: yaml.ScalarNode) -> float | int:
+    value: float = loader.construct_yaml_float(node)
+    return int(value) if _WHOLE.fullmatch(node.value) and math.isfinite(value) else value
+
+
+_Loader.add_constructor("tag:yaml.org,2002:float", _read_float)
 
 
 def load_config(
