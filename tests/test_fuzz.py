@@ -125,7 +125,22 @@ flags = [
 words = st.one_of(
     st.sampled_from(flags),
     st.sampled_from(
-        ["0", "3", "-1", "1e9", "1e400", "nan", "orca", "walk", "no/such", "reward.lambda_=0.5", "gamma=", "=1", "a=[[", "x=*a"]
+        [
+            "0",
+            "3",
+            "-1",
+            "1e9",
+            "1e400",
+            "nan",
+            "orca",
+            "walk",
+            "no/such",
+            "reward.lambda_=0.5",
+            "gamma=",
+            "=1",
+            "a=[[",
+            "x=*a",
+        ]
     ),
     st.text(max_size=6),
 )
@@ -150,7 +165,9 @@ commands = st.sampled_from(
 @both
 def test_a_command_line_never_ends_in_a_traceback(count, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("sb3_flock.cli.shared.evaluate_and_print", lambda *args, **kwargs: {})  # evaluation has its own tests
+    monkeypatch.setattr(
+        "sb3_flock.cli.shared.evaluate_and_print", lambda *args, **kwargs: {}
+    )  # evaluation has its own tests
 
     @examples(count)
     @given(commands, st.lists(words, max_size=5))

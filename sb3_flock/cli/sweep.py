@@ -34,7 +34,9 @@ def add(commands: Any) -> None:
         help="continue the sweep in this folder: unfinished and failed trials from their last checkpoints; Ray keeps its "
         "state as pickles, which run any code in them, so resume your own sweeps only",
     )
-    parser.add_argument("--evaluate", metavar="POLICY", help=f"evaluate this policy at every point instead: {shared.POLICY_HELP}")
+    parser.add_argument(
+        "--evaluate", metavar="POLICY", help=f"evaluate this policy at every point instead: {shared.POLICY_HELP}"
+    )
     parser.add_argument("-n", "--episodes", type=count(1), metavar="N", help="episodes a point, with --evaluate [1000]")
     parser.add_argument("--address", metavar="ADDRESS", help="a running Ray cluster's, or auto [this machine alone]")
     shared.add_output(

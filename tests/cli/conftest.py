@@ -13,7 +13,19 @@ TINY = [word for setting in SETTINGS for word in ("--set", setting)]
 def run_folder(tmp_path_factory):
     """A run folder made by the command itself."""
     out = tmp_path_factory.mktemp("out")
-    words = ["train", "--n-vehicles", "2", "--n-obstacles", "1", "--total-timesteps", "200", "--n-flocks", "2", "--seed", "3"]
+    words = [
+        "train",
+        "--n-vehicles",
+        "2",
+        "--n-obstacles",
+        "1",
+        "--total-timesteps",
+        "200",
+        "--n-flocks",
+        "2",
+        "--seed",
+        "3",
+    ]
     assert main([*words, "--eval-freq", "100", "--output-dir", str(out), *TINY]) == 0
     return out / "ddpg_2v1o_1"
 

@@ -1,7 +1,8 @@
 from sb3_flock.cli import main
 
 
-def test_compare_prints_the_runs_and_plots_them(run_folder, tmp_path, capsys):
+def test_compare_prints_the_runs_and_plots_them(run_folder, tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "160")
     path = tmp_path / "curves.svg"
     assert main(["compare", str(run_folder), str(run_folder), "-o", str(path)]) == 0
     captured = capsys.readouterr()

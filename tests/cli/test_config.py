@@ -55,7 +55,10 @@ def test_output_writes_the_config_to_a_file(tmp_path, capsys, fails):
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("n_vehicles: 5\n", "n_vehicles is not a parameter; did you mean scenario.n_vehicles? That is n_vehicles in the group scenario"),
+        (
+            "n_vehicles: 5\n",
+            "n_vehicles is not a parameter; did you mean scenario.n_vehicles? That is n_vehicles in the group scenario",
+        ),
         ("lr: 1e-3\n", "did you mean algorithm.learning_rate? That is learning_rate in the group algorithm"),
         ("learning_rate: 1e-3\n", "did you mean algorithm.learning_rate? That is learning_rate in the group algorithm"),
         ("network:\n  lr: 1e-3\n", "network.lr is not a parameter; did you mean algorithm.learning_rate?"),

@@ -30,7 +30,7 @@ NAMES = [command.__name__.rsplit(".", maxsplit=1)[-1] for command in COMMANDS]
         (["render", "ddpg-5v2o", "-o", "no/such/x.gif"], ["--output no/such/x.gif: there is no folder no/such"]),
         (["export", "ddpg-5v2o"], ["-o FILE"]),
         (["export", "ddpg-5v2o", "a.onnx", "-o", "b.onnx"], ["one -o FILE"]),
-        (["export", "ddpg-5v2o", "-o", "no/such/a.onnx"], ["--output no/such/a.onnx: No such file or directory"]),
+        (["export", "ddpg-5v2o", "-o", "no/such/a.onnx"], ["--output no/such/a.onnx: there is no folder no/such"]),
         (["compare", "x", "-o", "curves.pdf"], ["--output curves.pdf: a name that ends in .png, .svg is needed"]),
         (["reproduce", "-o", "/dev/null/x"], ["--output /dev/null/x: "]),
         (["sweep"], ["a FILE or --resume DIR is needed"]),

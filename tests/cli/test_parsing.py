@@ -5,7 +5,8 @@ from sb3_flock.cli.parsing import whole_number
 
 
 @pytest.mark.parametrize(
-    ("text", "number"), [("1e5", 100_000), ("1.5e3", 1500), ("2.0", 2), ("7", "7"), ("1.5", "1.5"), ("1e400", "1e400"), ("x", "x")]
+    ("text", "number"),
+    [("1e5", 100_000), ("1.5e3", 1500), ("2.0", 2), ("7", "7"), ("1.5", "1.5"), ("1e400", "1e400"), ("x", "x")],
 )
 def test_a_whole_number_may_have_an_exponent(text, number):
     assert whole_number(text) == number
