@@ -181,8 +181,8 @@ def test_a_command_line_never_ends_in_a_traceback(count, capsys, tmp_path, monke
         if code == 2:
             lines = captured.err.strip().split("\n")
             assert lines[-1].startswith("sb3-flock")
-            files = command.startswith("migrate") + len(more)  # migrate refuses each file in a line of its own
-            assert 1 <= len(lines) - captured.err.count("warning:") <= (files if command.startswith("migrate") else 1)
+            most = 1 + len(more) if command.startswith("migrate") else 1  # it refuses each file in a line of its own
+            assert 1 <= len(lines) - captured.err.count("warning:") <= most
             assert all(line.startswith("sb3-flock") for line in lines)
 
     check()

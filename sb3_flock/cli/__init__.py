@@ -51,7 +51,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parse(words: Sequence[str]) -> argparse.Namespace:
     """The options; a wrong flag ends the process with one line that suggests the right one."""
-    options, unknown = _parser().parse_known_args(words)
+    parser = _parser()
+    if any("\0" in word for word in words):  # only a caller of main can give one; no file's name has it
+        parser.error("a null character is in the arguments")
+    options, unknown = parser.parse_known_args(words)
     if unknown:
         options.parser.refuse(unknown)
     return options

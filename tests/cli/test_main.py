@@ -18,6 +18,7 @@ NAMES = [command.__name__.rsplit(".", maxsplit=1)[-1] for command in COMMANDS]
     [
         (["fly"], ["invalid choice: 'fly'", "migrate"]),
         ([], ["COMMAND"]),
+        (["migrate", "a\0b"], ["a null character"]),
         (["evaluate"], ["POLICY or --controller NAME"]),
         (["evaluate", "x.zip", "--controller", "orca"], ["not both"]),
         (["evaluate", "--controller", "boids"], ["controller = 'boids'", "olfati-saber"]),
