@@ -91,7 +91,7 @@ def reproduce(out: str | Path, quick: bool = False, console: Console | None = No
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise SettingsError(f"out = {out}: {error.strerror or error}") from None
+        raise SettingsError(f"{out}: {error.strerror or error}") from None
     policies = {name: load_policy(name) for name in shipped_policies()}
     tables: dict[str, dict[str, dict[str, Metric]]] = {}
     sections: dict[str, Callable[[], str]] = {

@@ -40,7 +40,14 @@ class RunError(RuntimeError):
 
 
 class SettingsError(UserError):
-    """A parameter has a value that is not accepted."""
+    """A parameter has a value that is not accepted.
+
+    :param parts: one message for each parameter
+    """
+
+    def __init__(self, *parts: str) -> None:
+        self.parts = parts
+        super().__init__("; ".join(parts))
 
 
 class Settings(BaseModel):
@@ -58,7 +65,7 @@ class Settings(BaseModel):
         try:
             super().__init__(**values)
         except ValidationError as error:
-            raise SettingsError("; ".join(_describe(type(self), e) for e in error.errors())) from None
+            raise SettingsError(*(_describe(type(self), e) for e in error.errors())) from None
 
     def replace(self: _Settings, **changes: Any) -> _Settings:
         """A validated copy with some fields changed.
@@ -146,7 +153,11 @@ def _describe(settings: type[Settings], error: Mapping[str, Any]) -> str:
     if error["type"] == "extra_forbidden":
         return f"{path} is not a parameter of {settings.__name__}{suggest(path, settings.model_fields)}"
     if error["type"] == "value_error":  # raised by a validator of ours, which names the parameter itself
-        return str(error["ctx"]["error"])
+        reason = error["ctx"]["error"]
+        field = settings.model_fields.get(str(error["loc"][0])) if error["loc"] else None
+        if field is None or group_of(field.annotation) is None:
+            return str(reason)
+        return "; ".join(f"{path}.{part}" for part in getattr(reason, "parts", (str(reason),)))
     message = error["msg"][0].lower() + error["msg"][1:]
     return f"{path} = {format_value(error['input'])}: {message}"
 

@@ -166,7 +166,7 @@ def export(policy: LoadedPolicy, path: str | Path, n_samples: int = 1000, seed: 
     """
     path = Path(path)
     if not path.absolute().parent.is_dir():
-        raise SettingsError(f"export {path}: there is no folder {path.parent}")
+        raise SettingsError(f"{path}: there is no folder {path.parent}")
     try:
         import onnx
         import onnxruntime

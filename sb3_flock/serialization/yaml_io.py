@@ -5,14 +5,16 @@ A file may hold any part of a config: fields that it leaves out keep their defau
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Iterable, Mapping
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
 
-from sb3_flock._renamed import warn_renamed
+from sb3_flock._renamed import RenamedWarning
 from sb3_flock.serialization.migrate import FORMAT, check_format, migrate_config
 from sb3_flock.settings import Settings, SettingsError, format_value, group_of, leaf_paths, resolve_path, suggest
 
@@ -20,12 +22,21 @@ _Settings = TypeVar("_Settings", bound=Settings)
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML's safe loader, which also reads 1e-3 as a number; in YAML 1.1 it is a string."""
+    """YAML's safe loader, which also reads 1e-3 as a number and 1e5 as an integer; in YAML 1.1 they are strings."""
 
 
 _Loader.add_implicit_resolver(
     "tag:yaml.org,2002:float", re.compile(r"^[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]+$"), list("-+.0123456789")
 )
+_WHOLE = re.compile(r"[-+]?[0-9]+[eE]\+?[0-9]+")
+
+
+def _read_float(loader: _Loader, node: yaml.ScalarNode) -> float | int:
+    value: float = loader.construct_yaml_float(node)
+    return int(value) if _WHOLE.fullmatch(node.value) and math.isfinite(value) else value
+
+
+_Loader.add_constructor("tag:yaml.org,2002:float", _read_float)
 
 
 def load_config(
@@ -44,7 +55,7 @@ def load_config(
     values: dict[str, Any] = {} if base is None else base.model_dump()
     if path is not None:
         values = _migrated(settings, read_yaml(Path(path)), Path(path))
-    _check_groups(settings, values, "")
+    check_groups(settings, values)
     for key, value in (overrides or {}).items():
         *groups, name = resolve_path(settings, key)
         level = values
@@ -107,27 +118,57 @@ def read_yaml(path: Path, text: str | None = None) -> dict[str, Any]:
     return values
 
 
+class EarlierFormatWarning(RenamedWarning):
+    """A file has names of an earlier release.
+
+    :param path: the file
+    :param renamed: (old, new) names
+    """
+
+    def __init__(self, path: Path, renamed: Sequence[tuple[str, str]]) -> None:
+        self.path = path
+        shown = [f"{old} is now {new}" for old, new in renamed[: _MOST_SHOWN if len(renamed) > _MAX_SHOWN else None]]
+        more = f", and {len(renamed) - len(shown)} more" if len(shown) < len(renamed) else ""
+        super().__init__(f"{path}: written by an earlier release ({', '.join(shown)}{more})")
+
+
+_MAX_SHOWN = 4
+_MOST_SHOWN = 2
+"""Renamed names in a warning: all up to the first number, else as many as the second."""
+
+
 def _migrated(settings: type[Settings], values: dict[str, Any], path: Path) -> dict[str, Any]:
-    """A file's values in the present format; one warning names all old names in it."""
+    """A file's values in the present format; one warning names old names in it."""
     number = check_format(values.pop("format", FORMAT))
     current, renamed = migrate_config(settings, values, number)
     if renamed:
-        old, new = (", ".join(names) for names in zip(*renamed, strict=True))
-        warn_renamed(f"{path}: {old}", new, stacklevel=4)
+        warnings.warn(EarlierFormatWarning(path, renamed), stacklevel=3)
     return current
 
 
-def _check_groups(settings: type[Settings], values: Mapping[str, Any], prefix: str) -> None:
-    """Refuse unknown names and scalars where a group belongs, with the whole path in the message."""
+def check_groups(settings: type[Settings], values: Mapping[str, Any], prefix: str = "") -> None:
+    """Check names and groups of a config's values, with the whole path in the message.
+
+    :raises SettingsError: for an unknown name, or a scalar where a group belongs
+    """
+    _check_groups(settings, settings, values, prefix)
+
+
+def _check_groups(whole: type[Settings], settings: type[Settings], values: Mapping[str, Any], prefix: str) -> None:
     for name, value in values.items():
         field = settings.model_fields.get(name) if isinstance(name, str) else None
         if field is None:
-            hint = suggest(str(name), [prefix + ".".join(path) for path in leaf_paths(settings)])
-            if not prefix and hint:
-                hint += ", in its group"
-            raise SettingsError(f"{prefix}{name} is not a parameter{hint}")
+            near = [prefix + ".".join(path) for path in leaf_paths(settings)]
+            hint = suggest(str(name), near) or suggest(str(name), [".".join(path) for path in leaf_paths(whole)])
+            raise SettingsError(f"{prefix}{name} is not a parameter{hint}{_place(hint, prefix)}")
         group = group_of(field.annotation)
         if group is not None:
             if not isinstance(value, Mapping):
                 raise SettingsError(f"{prefix}{name} = {format_value(value)}: a mapping of parameters is needed")
-            _check_groups(group, value, f"{prefix}{name}.")
+            _check_groups(whole, group, value, f"{prefix}{name}.")
+
+
+def _place(hint: str, prefix: str) -> str:
+    """Where a suggested field belongs in a file, if in another group: a key with dots is not read as groups there."""
+    group, _, name = hint.removeprefix("; did you mean ").removesuffix("?").rpartition(".")
+    return f" That is {name} in the group {group}" if hint and group and f"{group}." != prefix else ""

@@ -61,7 +61,7 @@ class Folder:
             self.filesystem: AbstractFileSystem
             self.filesystem, path = fsspec.core.url_to_fs(out)
         except (ImportError, ValueError, OSError) as error:
-            raise SettingsError(f"out = {out}: {' '.join(str(error).split())}") from None
+            raise SettingsError(f"{out}: {' '.join(str(error).split())}") from None
         self.name = out
         self.path = path.rstrip("/")
         self.is_plain = "://" not in out and "::" not in out
@@ -92,7 +92,7 @@ class Folder:
         try:
             yield
         except OSError as error:
-            raise SettingsError(f"out = {self.name}: {error.strerror or ' '.join(str(error).split())}") from None
+            raise SettingsError(f"{self.name}: {error.strerror or ' '.join(str(error).split())}") from None
 
     def for_ray(self) -> dict[str, Any]:
         """The arguments of Ray Tune for this storage; Ray itself handles a plain path, and checks that all machines share it."""
@@ -117,7 +117,7 @@ def sweep(config: SweepConfig, out: str, address: str | None = None) -> list[Tri
     policy = _check_points(config)
     folder = Folder(out)
     if folder.exists():
-        raise SettingsError(f"out = {out}: exists already; resume {out} to continue a sweep")
+        raise SettingsError(f"{out}: it exists already; resume its sweep, or choose another folder")
     with _cluster(config, address):
         folder.write(_CONFIG, to_yaml(config).encode())
         if policy is not None:
@@ -137,7 +137,7 @@ def resume_sweep(out: str, address: str | None = None) -> tuple[SweepConfig, lis
     _check_ray(address)
     folder = Folder(out)
     if not folder.exists(_CONFIG):
-        raise SettingsError(f"resume {out}: not a sweep's folder (there is no {_CONFIG})")
+        raise SettingsError(f"{out}: not a sweep's folder (there is no {_CONFIG})")
     config = load_sweep(_CONFIG, text=folder.read(_CONFIG).decode())
     policy = folder.read(_POLICY) if config.policy is not None else None
     with _cluster(config, address):
@@ -172,7 +172,7 @@ def _check_ray(address: str | None) -> None:
         host, _, port = found.removeprefix("ray://").rpartition(":")
         socket.create_connection((host, int(port)), timeout=10).close()
     except (OSError, ValueError) as error:
-        raise SettingsError(f"address = {address}: no Ray cluster answers there ({' '.join(str(error).split())})") from None
+        raise SettingsError(f"{address}: no Ray cluster answers there ({' '.join(str(error).split())})") from None
 
 
 @contextmanager
@@ -185,7 +185,7 @@ def _cluster(config: SweepConfig, address: str | None) -> Iterator[None]:
     try:
         ray.init(address=address or "local", include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
     except (ConnectionError, ValueError, RuntimeError) as error:
-        raise SettingsError(f"address = {address}: {' '.join(str(error).split())}") from None
+        raise SettingsError(f"{address}: {' '.join(str(error).split())}") from None
     try:
         have = ray.cluster_resources()  # type: ignore[no-untyped-call]
         for name, wanted in (("CPU", config.resources.cpus), ("GPU", config.resources.gpus)):
@@ -218,7 +218,7 @@ def _run(config: SweepConfig, folder: Folder, policy: bytes | None) -> list[Tria
         ended = [_ended(trial, folder) for trial in ray_trials(results)]
         trials = sorted(ended, key=lambda trial: trial.name)
     except tune.TuneError as error:
-        raise RunError(f"{str(error).strip().splitlines()[-1]}; resume {folder.name} to continue") from error
+        raise RunError(f"{str(error).strip().splitlines()[-1]}; the sweep in {folder.name} can be resumed") from error
     folder.write(RESULTS, _as_csv(config, trials).encode())
     return trials
 

@@ -1,0 +1,60 @@
+"""``sb3-flock evaluate``."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from sb3_flock.cli import shared
+from sb3_flock.cli.messages import written_to
+from sb3_flock.cli.parsing import add_command, count
+from sb3_flock.settings import SettingsError
+
+
+def add(commands: Any) -> None:
+    """Add the command."""
+    parser = add_command(
+        commands,
+        "evaluate",
+        run,
+        "runs/ddpg_5v2o_1 --n-vehicles 8 -o result.json",
+        help="simulate many episodes of a policy and print its metrics",
+        description="Simulate many episodes of a saved policy at once and print every metric with its interval.",
+        renamed={**shared.ROLLOUT_RENAMED, "--json": "--output"},
+    )
+    shared.add_rollout(parser)
+    parser.add_argument("-n", "--episodes", type=count(1), default=1000, metavar="N", help="number of episodes [1000]")
+    shared.add_output(parser, "also write the metrics to this file, as JSON")
+    parser.add_argument("--sensors", action="store_true", help="also show the effect of noise, missed detections and delay")
+
+
+def run(options: argparse.Namespace, words: Sequence[str]) -> int:
+    """Evaluate, print, and write JSON where asked for."""
+    from rich.console import Console
+
+    if options.output is not None and not Path(options.output).absolute().parent.is_dir():
+        raise SettingsError(f"--output {options.output}: there is no folder {Path(options.output).parent}")
+    controller, name, scenario = shared.rollout_of(options)
+    console = Console(stderr=True)
+    metrics = shared.evaluate_and_print(controller, name, scenario, options.episodes, options.seed, console)
+    if options.sensors:
+        from sb3_flock.evaluation.robustness import errors_table, evaluate_with_errors
+
+        with console.status("simulating sensor errors"):
+            Console().print(errors_table(evaluate_with_errors(controller, scenario, options.episodes, options.seed)))
+    if options.output is not None:
+        from sb3_flock.evaluation.report import write_json
+        from sb3_flock.serialization.save import versions
+
+        meta = {
+            **({"controller": name} if options.policy is None else controller.describe()),
+            "episodes": options.episodes,
+            "seed": options.seed,
+            "scenario": scenario.model_dump(mode="json"),
+            "evaluated_with": versions(),
+        }
+        with written_to("--output", options.output):
+            write_json(options.output, metrics, meta)
+    return 0

@@ -1,0 +1,52 @@
+"""``sb3-flock export``."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+from sb3_flock.cli import shared
+from sb3_flock.cli.messages import written_to
+from sb3_flock.cli.parsing import add_command
+from sb3_flock.settings import SettingsError
+
+
+def add(commands: Any) -> None:
+    """Add the command."""
+    parser = add_command(
+        commands,
+        "export",
+        run,
+        "ddpg-5v2o -o policy.onnx",
+        help="write a policy as ONNX, for a vehicle's computer",
+        description="Write a policy as an ONNX graph from measured positions to speed and turn rate, and check it.",
+        usage="%(prog)s [-h] -o FILE [--trust] POLICY",
+    )
+    parser.add_argument("policy", metavar="POLICY", help=shared.POLICY_HELP)
+    parser.add_argument("file", nargs="?", metavar="FILE", help=argparse.SUPPRESS)
+    shared.add_output(parser, "file to write, such as policy.onnx")
+    shared.add_trust(parser)
+
+
+def run(options: argparse.Namespace, words: Sequence[str]) -> int:
+    """Export, and print how well the graph agrees with the policy."""
+    import torch as th
+
+    from sb3_flock.deploy.onnx_export import export
+
+    if (options.output is None) == (options.file is None):
+        raise SettingsError("export: one -o FILE to write is needed")
+    output = options.output or options.file
+    th.set_num_threads(1)
+    policy = shared.load_trusted_or_not(options.policy, "cpu", options.trust)
+    with written_to("--output", output):
+        done = export(policy, output)
+    print(
+        f"differs from the policy by at most {done.difference:.1g} of the range over {done.n_samples} sample inputs; "
+        f"{1000 * done.latency:.3f} ms a decision (median, one core)",
+        file=sys.stderr,
+    )
+    print(done.path)
+    return 0

@@ -1,0 +1,150 @@
+"""``sb3-flock policies``."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from sb3_flock._renamed import POLICIES, warn_renamed
+from sb3_flock.cli.parsing import add_command, listed
+from sb3_flock.settings import SettingsError, suggest
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from sb3_flock.config.training import TrainingConfig
+
+
+def add(commands: Any) -> None:
+    """Add the command."""
+    parser = add_command(
+        commands,
+        "policies",
+        run,
+        "ddpg-bc-5v2o",
+        help="list the shipped policies, or show the model card of one",
+        description="List the shipped policies with their results on test episodes, or show the model card of one.",
+    )
+    parser.add_argument("name", nargs="?", metavar="NAME", help="show this policy's model card")
+
+
+def run(options: argparse.Namespace, words: Sequence[str]) -> int:
+    """Print the list or the card."""
+    from rich.console import Console
+
+    console = Console(highlight=False)
+    if options.name is None:
+        console.print(_list())
+        console.print(
+            "A task 5v2o has 5 vehicles and 2 obstacles. RL is reinforcement learning alone; RL+MPC also imitates the MPC "
+            "expert.\n`sb3-flock policies NAME` shows a model card, `sb3-flock play NAME` the policy."
+        )
+    else:
+        _print_card(_known(options.name), console)
+    return 0
+
+
+def _known(name: str) -> str:
+    from sb3_flock.pretrained import shipped_policies
+
+    if name in POLICIES:
+        warn_renamed(f"policy {name}", POLICIES[name])
+        name = POLICIES[name]
+    names = shipped_policies()
+    if name not in names:
+        raise SettingsError(f"{name}: not a shipped policy{suggest(name, names)}; there are {listed(names)}")
+    return name
+
+
+def _list() -> Table:
+    """A line for each policy; the metrics are of the training that was shipped."""
+    from rich.table import Table
+
+    from sb3_flock.evaluation.metrics import columns
+    from sb3_flock.evaluation.model_cards import read_card
+    from sb3_flock.evaluation.report import short_cells
+    from sb3_flock.pretrained import shipped_policies
+
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
+    for heading in ("name", "task", "method"):
+        table.add_column(heading, no_wrap=True)
+    for metric in columns().values():
+        table.add_column(str(metric.column).replace(" ", "\n"), justify="right")
+    table.add_column("size", justify="right", no_wrap=True)
+    for name, path in shipped_policies().items():
+        card = read_card(name)
+        config = _config(card)
+        scenario = config.scenario
+        task = f"{scenario.n_vehicles}v{scenario.n_obstacles}o {scenario.obstacle_motion}"
+        table.add_row(name, task, _method(config)[0], *short_cells(_shipped(card)["metrics"]), _size(path.stat().st_size))
+    return table
+
+
+def _config(card: Mapping[str, Any]) -> TrainingConfig:
+    from sb3_flock.config.training import TrainingConfig
+    from sb3_flock.serialization.migrate import FORMAT, migrate_config
+
+    return TrainingConfig(**migrate_config(TrainingConfig, card["config"], FORMAT)[0])
+
+
+def _shipped(card: Mapping[str, Any]) -> dict[str, Any]:
+    """The record of the training whose policy was shipped."""
+    return next(record for record in card["seeds"] if record["seed"] == card["shipped_seed"])
+
+
+def _method(config: TrainingConfig) -> tuple[str, str]:
+    """How the policy was trained, short and in words."""
+    expert = config.train_env.expert
+    if expert is None:
+        return "RL", "reinforcement learning alone"
+    name = expert.upper()
+    words = (
+        f"reinforcement learning with an {name} expert, which drives {config.train_env.expert_fraction:.0%} of the episodes"
+    )
+    if config.algorithm.bc_coef:
+        words += f"; behavior cloning of its actions (weight {config.algorithm.bc_coef:g})"
+    return f"RL+{name}", words
+
+
+def _size(n_bytes: int) -> str:
+    return f"{n_bytes / 1e6:.1f} MB"
+
+
+def _print_card(name: str, console: Any) -> None:
+    from sb3_flock.evaluation.metrics import METRICS
+    from sb3_flock.evaluation.model_cards import median_of_seeds, read_card
+    from sb3_flock.evaluation.report import plain_table
+    from sb3_flock.pretrained import shipped_policies
+
+    card = read_card(name)
+    shipped, path, config = _shipped(card), shipped_policies()[name], _config(card)
+    number = len(card["seeds"])
+    channels = "; motion channels" if config.scenario.motion_lag else ""
+    facts = {
+        "task": card["task"],
+        "method": f"{config.algo}: {_method(config)[1]}{channels}",
+        "trained": f"{shipped['transitions']} transitions, {shipped['minutes']:g} minutes",
+        "command": shipped["command"],
+        "with": listed(f"{package} {version}" for package, version in card["versions"].items()),
+        "trainings": f"{number}, which differ in the seed; the policy is that of seed {card['shipped_seed']}",
+        "file": f"{path.name}, {_size(path.stat().st_size)}",
+    }
+    grid = plain_table()
+    grid.show_header = False
+    grid.add_column(no_wrap=True)
+    grid.add_column(overflow="fold")
+    for key, value in facts.items():
+        grid.add_row(key, value)
+    console.print(name)
+    console.print(grid)
+    table = plain_table()
+    table.add_column("metric", no_wrap=True)
+    table.add_column("policy", justify="right", no_wrap=True)
+    table.add_column(f"median of {number}", justify="right", no_wrap=True)
+    medians = median_of_seeds(card)
+    for metric, kind in METRICS.items():
+        values = [values.get(metric) for values in (shipped["metrics"], medians)]
+        table.add_row(metric, *("-" if value is None else kind.format(value) for value in values))
+    console.print(f"Results on {card['episodes']} episodes of the task:")
+    console.print(table)

@@ -1,0 +1,47 @@
+"""``sb3-flock render``."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from sb3_flock.cli import shared
+from sb3_flock.cli.messages import written_to
+from sb3_flock.cli.parsing import add_command, count
+
+
+def add(commands: Any) -> None:
+    """Add the command."""
+    parser = add_command(
+        commands,
+        "render",
+        run,
+        "ddpg-5v2o -o episode.html --episode 3",
+        help="simulate one episode and write a figure, a video or a web page",
+        description="Simulate one episode and write it: .gif, .mp4 and .html are videos, .png and .svg show the paths.",
+        renamed={**shared.ROLLOUT_RENAMED, "--out": "--output"},
+    )
+    shared.add_rollout(parser)
+    shared.add_output(parser, "file to write; its ending is the format", required=True)
+    parser.add_argument("--episode", type=count(0), default=0, metavar="N", help="number of the seed's episode [0]")
+    shared.add_speed(parser)
+
+
+def run(options: argparse.Namespace, words: Sequence[str]) -> int:
+    """Render, and print the file's path."""
+    import torch as th
+    from rich.console import Console
+
+    from sb3_flock.viz.video import check_video, render
+
+    with written_to("--output", options.output):
+        check_video(Path(options.output), options.speed)
+    controller, name, scenario = shared.rollout_of(options)
+    th.set_num_threads(1)
+    title = f"{options.policy or name}: {scenario.bodies}, episode {options.episode} of seed {options.seed}"
+    with Console(stderr=True).status("simulating"), written_to("--output", options.output):
+        path = render(controller, scenario, options.output, options.seed, options.episode, options.speed, title)
+    print(path)
+    return 0
