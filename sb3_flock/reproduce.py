@@ -247,7 +247,7 @@ def _flock_sizes(folder: Path, policy: LoadedPolicy, episodes: int) -> str:
 
 def _sensors(policy: LoadedPolicy, episodes: int) -> str:
     rows = evaluate_with_errors(policy, policy.scenario, episodes)
-    headings = [METRICS[name].column or name for name in columns()]
+    headings = list(columns().values())
     lines = [
         "## Sensor errors\n",
         f"`ddpg-5v2o`, trained without errors; {episodes} episodes a row (`sb3-flock evaluate ddpg-5v2o --sensors`):\n",

@@ -69,8 +69,8 @@ def _list() -> Table:
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
     for heading in ("name", "task", "method"):
         table.add_column(heading, no_wrap=True)
-    for metric in columns().values():
-        table.add_column(str(metric.column).replace(" ", "\n"), justify="right")
+    for heading in columns().values():
+        table.add_column(heading.replace(" ", "\n"), justify="right")
     table.add_column("size", justify="right", no_wrap=True)
     for name, path in shipped_policies().items():
         card = read_card(name)

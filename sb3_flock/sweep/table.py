@@ -12,7 +12,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from sb3_flock.evaluation.metrics import METRICS, columns
+from sb3_flock.evaluation.metrics import columns
 from sb3_flock.evaluation.report import add_short_columns, plain_table, short_cells
 
 _OTHER_COLUMNS = 54
@@ -50,7 +50,7 @@ class TrialsTable(tune.Callback):
     def on_trial_complete(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
         """A trial has ended."""
         self._ended.append(trial)
-        named = zip((METRICS[name].column for name in columns()), _cells(trial), strict=True)
+        named = zip(columns().values(), _cells(trial), strict=True)
         self._report(trials, f"{trial}: {', '.join([_state(trial), *(f'{name} {cell}' for name, cell in named if cell)])}")
 
     def on_trial_error(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
