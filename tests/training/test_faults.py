@@ -308,6 +308,6 @@ def test_two_trainings_never_share_a_run_folder(tmp_path, start):
     assert [folder.name for folder in folders] == ["ddpg_3v1o_1", "ddpg_3v1o_2"]
     code, _, errors = start("--resume", folders[0]).end()
     assert code == 2
-    assert errors == f"sb3-flock: resume {folders[0]}: another process trains in this folder\n"
+    assert errors == f"sb3-flock: {folders[0]}: another process trains in this folder\n"
     for run in runs:
         run.end(signal.SIGTERM)

@@ -45,7 +45,7 @@ def test_the_panel_of_a_plain_script_is_removed_at_the_end():
     script(callback)
     shown = console.file.getvalue()
     assert "training" in shown
-    assert "/60 " in shown
+    assert "env steps/s" in shown
     assert "\x1b[?25l" in shown  # the cursor is hidden ...
     assert shown.rindex("\x1b[?25h") > shown.rindex("\x1b[?25l")  # ... and shown again
     callback.stop()
