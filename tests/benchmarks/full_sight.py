@@ -24,9 +24,9 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from sb3_flock.config.training import TrainingConfig
-from sb3_flock.controllers import MPC, Orca
 from sb3_flock.controllers.base import Controller
-from sb3_flock.controllers.mpc import MPCConfig
+from sb3_flock.controllers.mpc import MPC, MPCConfig
+from sb3_flock.controllers.orca import Orca
 from sb3_flock.evaluation.rollout import rollout_batch
 from sb3_flock.serialization.yaml_io import load_config
 from sb3_flock.sim import Scenario, Sensing, World, episode_rng
