@@ -59,11 +59,11 @@ def test_the_file_tells_what_a_vehicle_needs(exported):
     assert [(part.name, part.shape[-1], part.type) for part in session.get_inputs()] == [
         (name, 2, "tensor(double)") for name in INPUTS
     ]
-    told = json.loads(session.get_modelmeta().custom_metadata_map["sb3_flock"])
-    assert told["link_range"] == 0.15
-    assert told["time_step"] == 0.1
-    assert told["policy"] == "ddpg-3v1o.zip"
-    assert "body frame" in told["inputs"]
+    metadata = json.loads(session.get_modelmeta().custom_metadata_map["sb3_flock"])
+    assert metadata["link_range"] == 0.15
+    assert metadata["time_step"] == 0.1
+    assert metadata["policy"] == "ddpg-3v1o.zip"
+    assert "body frame" in metadata["inputs"]
 
 
 @pytest.mark.parametrize(
@@ -87,9 +87,9 @@ def test_a_second_look_counts_aboard(tmp_path):
     export(load_policy(result.folder / "final_model.zip"), path, situations=5)
     session = onnxruntime.InferenceSession(path)
     assert [part.name for part in session.get_inputs()] == [*INPUTS, *EARLIER_INPUTS]
-    told = json.loads(session.get_modelmeta().custom_metadata_map["sb3_flock"])
-    assert told["motion_lag"] == 0.2
-    assert "..._before" in told["inputs"]
+    metadata = json.loads(session.get_modelmeta().custom_metadata_map["sb3_flock"])
+    assert metadata["motion_lag"] == 0.2
+    assert "..._before" in metadata["inputs"]
     near, waypoint = np.array([[0.08, 0.05]]), np.array([0.2, 0.1])
     still = {"neighbors": near, "obstacles": near[:0], "waypoint": waypoint}
     still |= {f"{name}_before": positions for name, positions in still.items()} | {"moved": np.zeros(3)}
@@ -122,9 +122,9 @@ def test_mistakes_are_one_line(tmp_path, capsys):
 def test_the_command_tells_the_difference_and_the_time(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(onboard, "_compare", lambda *_: (3e-7, 1.2e-4))
     assert main(["export", "ddpg-3v1o", str(tmp_path / "policy.onnx")]) == 0
-    told = capsys.readouterr()
-    assert told.out == f"{tmp_path / 'policy.onnx'}\n"
+    metadata = capsys.readouterr()
+    assert metadata.out == f"{tmp_path / 'policy.onnx'}\n"
     assert (
-        told.err
+        metadata.err
         == "differs from the policy by at most 3e-07 of the range in 1000 situations; 0.120 ms a decision (median, one core)\n"
     )

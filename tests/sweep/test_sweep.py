@@ -81,7 +81,7 @@ def test_a_grid_writes_run_folders_a_table_and_a_ranking_and_survives_diverging_
     """The storage is one that Ray reaches through fsspec alone."""
     file = sweep_file(tmp_path, f"base: {SMALL}\ngrid: {{learning_rate: [0.0005, 1000000.0], seed: [0, 1]}}\n")
     out = tmp_path / "out"
-    code, output, errors = Sweep(file, "--out", f"local://{out}", "--set", "total_timesteps=420").end()
+    code, output, errors = Sweep(file, "--output", f"local://{out}", "--set", "total_timesteps=420").end()
     assert code == 0, errors
     rows = results(out)
     assert {(row["algorithm.learning_rate"], row["seed"], row["status"]) for row in rows} == {
@@ -98,15 +98,15 @@ def test_a_grid_writes_run_folders_a_table_and_a_ranking_and_survives_diverging_
     for name in ("sweep.yaml", "ranking.csv", "ranking.png", "ranking.svg"):
         assert (out / name).stat().st_size > 0
 
-    code, _, errors = Sweep(file, "--out", f"local://{out}").end()
+    code, _, errors = Sweep(file, "--output", f"local://{out}").end()
     assert code == 2
-    assert f"out = local://{out}: exists already; resume local://{out} to continue a sweep" in errors
+    assert f"--output local://{out}: it exists already; resume its sweep, or choose another folder" in errors
 
 
 @pytest.mark.slow
 def test_a_sweep_with_a_killed_driver_resumes_to_the_same_policies(tmp_path):
     file, out = sweep_file(tmp_path, f"base: {LONG}\ngrid: {{seed: [0, 1]}}\n"), tmp_path / "out"
-    first = Sweep(file, "--out", out)
+    first = Sweep(file, "--output", out)
     first.wait_for_checkpoints(out, 2)
     time.sleep(0.5)
     first.process.send_signal(signal.SIGKILL)
@@ -129,7 +129,7 @@ def test_the_trial_of_a_killed_node_resumes_on_the_other_node(tmp_path):
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
     try:
         node = cluster.add_node(num_cpus=1)
-        run = Sweep(file, "--out", out, "--address", cluster.address)
+        run = Sweep(file, "--output", out, "--address", cluster.address)
         run.wait_for_checkpoints(out, 2)
         raylet = str(node.all_processes["raylet"][0].process.pid)
         workers = subprocess.run(["pgrep", "-P", raylet], capture_output=True, text=True, check=True).stdout.split()
@@ -148,7 +148,7 @@ def test_the_trial_of_a_killed_node_resumes_on_the_other_node(tmp_path):
 @pytest.mark.slow
 def test_an_interrupted_sweep_says_how_to_resume(tmp_path):
     file, out = sweep_file(tmp_path, f"base: {LONG}\ngrid: {{seed: [0, 1, 2]}}\n"), tmp_path / "out"
-    run = Sweep(file, "--out", out)
+    run = Sweep(file, "--output", out)
     run.wait_for_checkpoints(out, 1)
     run.process.send_signal(signal.SIGINT)
     code, _, errors = run.end()
@@ -161,7 +161,7 @@ def test_an_interrupted_sweep_says_how_to_resume(tmp_path):
 def test_a_search_prints_its_best_trials(tmp_path):
     space = "{learning_rate: {low: 0.0001, high: 0.01, log: true}, batch_size: {low: 8, high: 32}, gamma: [0.9, 0.96]}"
     file, out = sweep_file(tmp_path, f"base: {SMALL}\nsearch: {space}\ntrials: 2\n"), tmp_path / "out"
-    code, output, errors = Sweep(file, "--out", out).end()
+    code, output, errors = Sweep(file, "--output", out).end()
     assert code == 0, errors
     rows = results(out)
     assert len(rows) == 2
@@ -174,7 +174,7 @@ def test_a_policy_over_a_grid_has_the_metrics_of_evaluate(tmp_path):
     from sb3_flock import evaluate
 
     file, out = sweep_file(tmp_path, "grid: {n_vehicles: [1, 4], seed: [3]}\n"), tmp_path / "out"
-    code, _, errors = Sweep(file, "--evaluate", "ddpg-3v1o", "--episodes", "5", "--out", out).end()
+    code, _, errors = Sweep(file, "--evaluate", "ddpg-3v1o", "--episodes", "5", "--output", out).end()
     assert code == 0, errors
     policy = load_policy("ddpg-3v1o")
     for row in results(out):
@@ -187,9 +187,9 @@ def test_a_policy_over_a_grid_has_the_metrics_of_evaluate(tmp_path):
     ("words", "message"),
     [
         (["--set", "n_vehicles=-1"], "n_vehicles = -1: input should be greater than or equal to 1"),
-        (["--address", "127.0.0.1:9"], "address = 127.0.0.1:9: no Ray cluster answers there"),
-        (["--address", "nowhere"], "address = nowhere: no Ray cluster answers there"),
-        (["--out", "strange://x"], "out = strange://x: Protocol not known: strange"),
+        (["--address", "127.0.0.1:9"], "--address 127.0.0.1:9: no Ray cluster answers there"),
+        (["--address", "nowhere"], "--address nowhere: no Ray cluster answers there"),
+        (["--output", "strange://x"], "--output strange://x: Protocol not known: strange"),
         (["--evaluate", "nobody"], "nobody: no such file or run folder"),
         (
             ["--evaluate", "general", "--set", "n_anchors=7"],
@@ -227,7 +227,7 @@ def test_a_trial_of_the_previous_release_has_todays_names(tmp_path):
 
 def test_more_resources_than_the_machine_has_are_refused(tmp_path):
     file = sweep_file(tmp_path, "grid: {seed: [0, 1]}\nresources: {cpus: 1024}\n")
-    code, _, errors = Sweep(file, "--out", tmp_path / "out").end()
+    code, _, errors = Sweep(file, "--output", tmp_path / "out").end()
     assert code == 2
     assert "resources.cpus = 1024: this machine has" in errors.splitlines()[-1]
     assert not (tmp_path / "out").exists()
