@@ -168,12 +168,19 @@ def test_workers_are_recognized_and_reset_with_given_seeds_or_flocks_would_repea
 # -- Ray -------------------------------------------------------------------------------------------------------------
 
 
-def test_ray_addresses_or_a_sweep_would_start_a_cluster_of_its_own():
-    pytest.importorskip("ray")
+def test_ray_addresses_or_a_sweep_would_start_a_cluster_of_its_own(monkeypatch):
+    services = pytest.importorskip("ray._private.services")
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
     assert _compat.find_ray_cluster("192.0.2.7:6379") == "192.0.2.7:6379"
     assert _compat.find_ray_cluster("local") == ""
+    with pytest.raises(ValueError, match="Invalid address format"):
+        _compat.find_ray_cluster("no address")
+    monkeypatch.setattr(services, "find_gcs_addresses", set)  # as on a machine where no cluster runs
+    monkeypatch.setattr(services, "find_bootstrap_address", lambda *_: None)
     with pytest.raises(ConnectionError):
         _compat.find_ray_cluster("auto")
+    monkeypatch.setattr(services, "find_gcs_addresses", lambda: {"192.0.2.8:1234"})
+    assert _compat.find_ray_cluster("auto") == "192.0.2.8:1234"
 
 
 def test_ray_trials_or_a_sweep_would_have_no_results():

@@ -7,9 +7,11 @@ import torch as th
 
 from sb3_flock import load_policy, train
 from sb3_flock.cli import main
-from sb3_flock.deploy.onnx_export import EARLIER_INPUTS, INPUTS, TOLERANCE, OnnxPolicy, export, random_sample_inputs
-from sb3_flock.rl import onboard
+from sb3_flock.deploy import onnx_export
+from sb3_flock.deploy.onnx_export import INPUTS, PREVIOUS_INPUTS, TOLERANCE, OnnxPolicy, export, random_sample_inputs
 from sb3_flock.settings import RunError, SettingsError
+from sb3_flock.sim import observation
+from sb3_flock.sim.observation import Channel, register_channel
 from tests.helpers import quiet, tiny
 
 
@@ -20,41 +22,41 @@ def policy():
 
 @pytest.fixture(scope="module")
 def exported(policy, tmp_path_factory):
-    return export(policy, tmp_path_factory.mktemp("onboard") / "policy.onnx", situations=200)
+    return export(policy, tmp_path_factory.mktemp("onnx") / "policy.onnx", n_samples=200)
 
 
-def decide(path, *situation):
+def act(path, *sample):
     session = onnxruntime.InferenceSession(path)
-    return session.run(None, dict(zip(INPUTS, situation, strict=True)))[0]
+    return session.run(None, dict(zip(INPUTS, sample, strict=True)))[0]
 
 
-def test_it_decides_as_predict_does(exported, policy):
-    assert exported.situations == 200
+def test_the_graph_acts_as_predict_does(exported, policy):
+    assert exported.n_samples == 200
     assert exported.difference < TOLERANCE
     session = onnxruntime.InferenceSession(exported.path)
     high = np.array([0.15, np.pi])
-    for situation, tensor in random_sample_inputs(policy.scenario, 200, seed=7):
-        (action,) = session.run(None, situation)
-        np.testing.assert_allclose(action / high, policy.predict(tensor)[0] / high, atol=1e-5)
+    for sample, expected in random_sample_inputs(policy.scenario, 200, seed=7):
+        (action,) = session.run(None, sample)
+        np.testing.assert_allclose(action / high, policy.predict(expected)[0] / high, atol=1e-5)
 
 
-def test_situations_are_of_all_kinds(policy):
-    situations = [situation for situation, _ in random_sample_inputs(policy.scenario, 200, seed=0)]
-    assert {len(situation["neighbors"]) for situation in situations} == set(range(12))
-    assert {len(situation["obstacles"]) for situation in situations} == set(range(6))
-    nearest = [np.linalg.norm(situation["neighbors"], axis=-1).min(initial=9) for situation in situations]
+def test_sample_inputs_have_all_numbers_of_bodies_near_and_far(policy):
+    samples = [sample for sample, _ in random_sample_inputs(policy.scenario, 200, seed=0)]
+    assert {len(sample["neighbors"]) for sample in samples} == set(range(12))
+    assert {len(sample["obstacles"]) for sample in samples} == set(range(6))
+    nearest = [np.linalg.norm(sample["neighbors"], axis=-1).min(initial=9) for sample in samples]
     assert min(nearest) < policy.scenario.link_range < max(nearest)
 
 
-def test_what_is_out_of_range_does_not_count(exported):
+def test_bodies_out_of_range_are_ignored(exported):
     near, waypoint = np.array([[0.08, 0.05]]), np.array([0.2, 0.1])
-    alone = decide(exported.path, near, np.zeros((0, 2)), waypoint)
-    crowd = decide(exported.path, np.array([[0.08, 0.05], [0.2, 0.0], [0.0, 0.151]]), np.array([[0.0, 0.26]]), waypoint)
+    alone = act(exported.path, near, np.zeros((0, 2)), waypoint)
+    crowd = act(exported.path, np.array([[0.08, 0.05], [0.2, 0.0], [0.0, 0.151]]), np.array([[0.0, 0.26]]), waypoint)
     np.testing.assert_array_equal(alone, crowd)
-    assert np.abs(decide(exported.path, near[:0], np.zeros((0, 2)), waypoint) - alone).max() > 1e-3
+    assert np.abs(act(exported.path, near[:0], np.zeros((0, 2)), waypoint) - alone).max() > 1e-3
 
 
-def test_the_file_tells_what_a_vehicle_needs(exported):
+def test_the_file_holds_what_a_vehicle_needs(exported):
     session = onnxruntime.InferenceSession(exported.path)
     assert [(part.name, part.shape[-1], part.type) for part in session.get_inputs()] == [
         (name, 2, "tensor(double)") for name in INPUTS
@@ -75,32 +77,32 @@ def test_the_file_tells_what_a_vehicle_needs(exported):
         {"motion_lag": 2.0, "obstacle_starts": [[0.5, 0.5]], "sensors.delay": 0.2},
     ],
 )
-def test_other_algorithms_networks_and_tensors(tmp_path, changes):
+def test_other_algorithms_networks_and_observations(tmp_path, changes):
     result = train(tiny(tmp_path, **changes), quiet())
-    done = export(load_policy(result.folder / "final_model.zip"), tmp_path / "other.onnx", situations=50)
+    done = export(load_policy(result.folder / "final_model.zip"), tmp_path / "other.onnx", n_samples=50)
     assert done.difference < TOLERANCE
 
 
-def test_a_second_look_counts_aboard(tmp_path):
+def test_the_graph_with_motion_channels_takes_the_previous_measurement(tmp_path):
     result = train(tiny(tmp_path, motion_lag=0.2), quiet())
     path = tmp_path / "policy.onnx"
-    export(load_policy(result.folder / "final_model.zip"), path, situations=5)
+    export(load_policy(result.folder / "final_model.zip"), path, n_samples=5)
     session = onnxruntime.InferenceSession(path)
-    assert [part.name for part in session.get_inputs()] == [*INPUTS, *EARLIER_INPUTS]
+    assert [part.name for part in session.get_inputs()] == [*INPUTS, *PREVIOUS_INPUTS]
     metadata = json.loads(session.get_modelmeta().custom_metadata_map["sb3_flock"])
     assert metadata["motion_lag"] == 0.2
-    assert "..._before" in metadata["inputs"]
+    assert "previous_..." in metadata["inputs"]
     near, waypoint = np.array([[0.08, 0.05]]), np.array([0.2, 0.1])
     still = {"neighbors": near, "obstacles": near[:0], "waypoint": waypoint}
-    still |= {f"{name}_before": positions for name, positions in still.items()} | {"moved": np.zeros(3)}
-    (standing,) = session.run(None, still)
-    (coming,) = session.run(None, {**still, "neighbors_before": near + 0.03})
-    (unseen,) = session.run(None, {**still, "neighbors_before": np.array([[0.08, 0.05], [0.2, 0.0]])})
-    assert np.abs(coming - standing).max() > 1e-6
-    np.testing.assert_array_equal(unseen, standing)
+    still |= {f"previous_{name}": positions for name, positions in still.items()} | {"ego_motion": np.zeros(3)}
+    (at_rest,) = session.run(None, still)
+    (approaching,) = session.run(None, {**still, "previous_neighbors": near + 0.03})
+    (unseen,) = session.run(None, {**still, "previous_neighbors": np.array([[0.08, 0.05], [0.2, 0.0]])})
+    assert np.abs(approaching - at_rest).max() > 1e-6
+    np.testing.assert_array_equal(unseen, at_rest)
 
 
-def test_a_graph_that_decides_otherwise_is_not_written(policy, tmp_path, monkeypatch):
+def test_a_graph_that_acts_otherwise_is_not_written(policy, tmp_path, monkeypatch):
     right = OnnxPolicy.forward
 
     def wrong(self, neighbors, obstacles, waypoint):
@@ -108,23 +110,70 @@ def test_a_graph_that_decides_otherwise_is_not_written(policy, tmp_path, monkeyp
 
     monkeypatch.setattr(OnnxPolicy, "forward", wrong)
     with pytest.raises(RunError, match="differs from the policy by 0.00016 of the range"):
-        export(policy, tmp_path / "policy.onnx", situations=3)
+        export(policy, tmp_path / "policy.onnx", n_samples=3)
     assert not list(tmp_path.iterdir())
 
 
-def test_mistakes_are_one_line(tmp_path, capsys):
+def test_mistakes_are_one_line(policy, tmp_path):
+    with pytest.raises(SettingsError, match=f"there is no folder {tmp_path / 'no'}$"):
+        export(policy, tmp_path / "no" / "policy.onnx")
+    with pytest.raises(SettingsError, match="DDPG, TD3 or SAC is needed, not object"):
+        OnnxPolicy(object(), policy.scenario)
+
+
+def test_the_command_prints_the_difference_and_the_time(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(onnx_export, "_compare", lambda *_: (3e-7, 1.2e-4))
+    assert main(["export", "ddpg-3v1o", str(tmp_path / "policy.onnx")]) == 0
+    printed = capsys.readouterr()
+    assert printed.out == f"{tmp_path / 'policy.onnx'}\n"
+    difference = "differs from the policy by at most 3e-07 of the range over 1000 sample inputs"
+    assert printed.err == f"{difference}; 0.120 ms a decision (median, one core)\n"
     assert main(["export", "ddpg-3v1o", str(tmp_path / "no" / "policy.onnx")]) == 2
     assert capsys.readouterr().err.endswith(f"there is no folder {tmp_path / 'no'}\n")
-    with pytest.raises(SettingsError, match="DDPG, TD3 or SAC is needed, not object"):
-        OnnxPolicy(object(), load_policy("ddpg-3v1o").scenario)
 
 
-def test_the_command_tells_the_difference_and_the_time(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(onboard, "_compare", lambda *_: (3e-7, 1.2e-4))
-    assert main(["export", "ddpg-3v1o", str(tmp_path / "policy.onnx")]) == 0
-    metadata = capsys.readouterr()
-    assert metadata.out == f"{tmp_path / 'policy.onnx'}\n"
-    assert (
-        metadata.err
-        == "differs from the policy by at most 3e-07 of the range in 1000 situations; 0.120 ms a decision (median, one core)\n"
-    )
+@pytest.fixture
+def _channel_ahead():
+    """A further channel: the neighbors ahead of the vehicle, within half of the link range to its sides."""
+    before = dict(observation.CHANNELS)
+
+    def is_ahead(positions):
+        return (positions[:, 0] > 0) & (abs(positions[:, 1]) < 0.08)
+
+    register_channel(Channel("ahead", "neighbors", lambda settings: settings.link_range, is_ahead))
+    register_channel(Channel("goal_left", "waypoint", lambda settings: 0.1, lambda positions: positions[:, 1] > 0))
+    yield
+    observation.CHANNELS.clear()
+    observation.CHANNELS.update(before)
+
+
+class Observer(th.nn.Module):
+    """An actor whose action is its observation."""
+
+    def forward(self, observations):
+        return observations
+
+
+@pytest.mark.usefixtures("_channel_ahead")
+@pytest.mark.parametrize("motion_lag", [0.0, 0.2])
+def test_extra_channels_in_the_graph_equal_the_numpy_observation(policy, motion_lag):
+    scenario = policy.scenario.replace(extra_channels=("ahead", "goal_left"), motion_lag=motion_lag)
+    module = OnnxPolicy(policy.policy, scenario)
+    module.actor, module.low, module.high = Observer(), th.tensor(-1.0), th.tensor(1.0)  # the output is the observation
+    shown, selects = np.zeros(scenario.observation_shape[0], bool), False
+    for sample, expected in random_sample_inputs(scenario, 100, seed=3):
+        assert expected.shape == scenario.observation_shape
+        computed = module(*(th.from_numpy(sample[name]) for name in onnx_export.inputs_of(scenario)))
+        np.testing.assert_allclose(computed.numpy(), expected, atol=1e-5)
+        shown |= np.abs(expected).max((1, 2)) > 0.1
+        selects |= not np.array_equal(expected[3], expected[0])
+    assert shown.all()
+    assert selects
+
+
+@pytest.mark.usefixtures("_channel_ahead")
+def test_a_policy_with_an_extra_channel_is_exported(tmp_path):
+    result = train(tiny(tmp_path, extra_channels=["ahead"], motion_lag=0.2), quiet())
+    loaded = load_policy(result.folder / "final_model.zip")
+    assert loaded.scenario.observation_shape == (8, 11, 11)
+    assert export(loaded, tmp_path / "policy.onnx", n_samples=50).difference < TOLERANCE

@@ -127,8 +127,10 @@ def test_arguments_of_the_previous_release_warn_and_work():
     ]
     assert buffer.mirror_augmentation
     assert buffer.expert_actions is not None
-    with pytest.raises(TypeError, match="unexpected argument 'colour'"):
-        CompactReplayBuffer(80, *SPACES, device="cpu", n_envs=N_ENVS, colour="red")
+    with pytest.raises(TypeError, match="got mirror_augmentation and its old name mirror"):
+        CompactReplayBuffer(80, *SPACES, device="cpu", n_envs=N_ENVS, mirror=True, mirror_augmentation=True)
+    with pytest.raises(TypeError, match="unexpected argument 'color'"):
+        CompactReplayBuffer(80, *SPACES, device="cpu", n_envs=N_ENVS, color="red")
 
 
 @pytest.mark.parametrize("kind", [CompactReplayBuffer, ReplayBuffer])

@@ -175,9 +175,9 @@ def test_a_wrong_or_missing_number_of_agents_is_refused():
     for wrong in (3, 2):
         with pytest.raises(SettingsError, match=f"n_agents = {wrong}.*which is 4"):
             learn(env, NeighborInclusiveReward(n_agents=wrong), 1, FlockCNN)
-    foreign = DummyVecEnv([lambda: gymnasium.make("Pendulum-v1")])
+    other = DummyVecEnv([lambda: gymnasium.make("Pendulum-v1")])
     with pytest.raises(SettingsError, match="n_agents = None.*divisor of 1"):
-        learn(foreign, NeighborInclusiveReward(), 1)
+        learn(other, NeighborInclusiveReward(), 1)
 
 
 @pytest.mark.parametrize("lambda_", [-0.1, 1.1, float("nan")])

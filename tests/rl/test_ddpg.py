@@ -6,6 +6,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_flock import CompactReplayBuffer, FlockCNN, FlockDDPG, FlockPolicy, make_vec_env
+from sb3_flock._renamed import RenamedWarning
 from sb3_flock.settings import SettingsError
 from tests.helpers import PlainCNN
 
@@ -85,6 +86,16 @@ def test_bc_coef_without_expert_actions_is_refused_in_one_line():
         SettingsError, match="bc_coef = 2.0: a CompactReplayBuffer with store_expert_actions=True is needed, or bc_coef 0"
     ):
         FlockDDPG(FlockPolicy, make_vec_env(n_flocks=1), bc_coef=2.0, device="cpu")
+
+
+def test_guidance_of_the_previous_release_warns_and_is_bc_coef():
+    options = {"replay_buffer_class": CompactReplayBuffer, "replay_buffer_kwargs": {"store_expert_actions": True}}
+    env = make_vec_env(n_flocks=1)
+    with pytest.warns(RenamedWarning, match="FlockDDPG: guidance is now bc_coef"):
+        ddpg = FlockDDPG(FlockPolicy, env, guidance=2.0, buffer_size=12, device="cpu", **options)
+    assert ddpg.bc_coef == 2.0
+    with pytest.raises(TypeError, match="FlockDDPG got bc_coef and its old name guidance"):
+        FlockDDPG(FlockPolicy, env, guidance=2.0, bc_coef=1.0, buffer_size=12, device="cpu", **options)
 
 
 def test_another_extractor_is_refused_in_one_line():

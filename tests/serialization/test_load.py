@@ -52,7 +52,7 @@ def broken_files(saved):
     text.write_text("not a zip")
     empty.write_bytes(b"")
     wider = {**member, "config": {**member["config"], "network": {**member["config"]["network"], "features_dim": 32}}}
-    unknown = {**member, "config": {**member["config"], "colour": "red"}}
+    unknown = {**member, "config": {**member["config"], "color": "red"}}
     yield saved.with_name("missing.zip"), "no such file"
     yield truncated, "damaged or not a policy"
     yield text, "damaged or not a policy"
@@ -62,7 +62,7 @@ def broken_files(saved):
         ({"flock.json": b"{"}, "damaged or not a policy"),
         ({"flock.json": b"[]"}, "do not fit"),
         ({"flock.json": json.dumps(wider).encode()}, "do not fit"),
-        ({"flock.json": json.dumps(unknown).encode()}, "colour is not a parameter"),
+        ({"flock.json": json.dumps(unknown).encode()}, "color is not a parameter"),
         ({"flock.json": json.dumps({**member, "format": 9}).encode()}, "format = 9"),
         ({"policy.pth": b"garbage"}, "damaged or not a policy"),
         ({"policy.pth": None}, "damaged or not a policy"),
@@ -133,7 +133,7 @@ def test_no_code_in_a_file_is_ever_run(saved, tmp_path):
             load_policy(file)
             loaded += 1
         except PolicyError as error:
-            assert "\n" not in str(error)  # noqa: PT017 - either is fine
+            assert "\n" not in str(error)  # noqa: PT017 - both outcomes are accepted
         assert not mark.exists()
     assert loaded >= 5  # members that inference does not need are not read
 
