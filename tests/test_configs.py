@@ -95,7 +95,7 @@ def test_the_papers_experiments_are_the_defaults_with_its_numbers_of_bodies(name
     assert config.scenario.replace(**bodies) == TrainingConfig().scenario
 
 
-def test_the_plain_recipe_is_the_papers():
+def test_the_plain_method_is_the_papers():
     config = load("paper_plain")
     reward = config.scenario.reward
     assert (reward.link_bonus, reward.separation_penalty, reward.obstacle_penalty, reward.scale) == (1, 1, 1, 1)
