@@ -31,7 +31,17 @@ def timed_sweep(workers: int, trials: int, folder: Path) -> tuple[float, list[di
     file.write_text(f"base: {TRAINING}\ngrid: {{seed: {list(range(trials))}}}\n")
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": workers, "include_dashboard": False})
     try:
-        words = [sys.executable, "-m", "sb3_flock.cli", "sweep", str(file), "--output", str(out), "--address", cluster.address]
+        words = [
+            sys.executable,
+            "-m",
+            "sb3_flock.cli",
+            "sweep",
+            str(file),
+            "--output",
+            str(out),
+            "--address",
+            cluster.address,
+        ]
         started = time.monotonic()
         subprocess.run(words, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         seconds = time.monotonic() - started
