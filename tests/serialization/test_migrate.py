@@ -144,15 +144,16 @@ def test_a_present_config_is_not_changed():
     assert migrate_config(TrainingConfig, values, FORMAT) == (values, [])
 
 
-def test_an_old_file_warns_once_with_all_names_and_means_the_same(tmp_path):
+def test_an_old_file_warns_in_one_line_and_means_the_same(tmp_path):
     path = tmp_path / "config.yaml"
     path.write_text(OLD_CONFIG)
     with pytest.warns(RenamedWarning) as warned:
         config = load_config(TrainingConfig, path)
     assert config == TrainingConfig(**SAME_CONFIG)
     (line,) = [str(warning.message) for warning in warned]
-    for words in ("practice", "algorithm.guidance", "is now", "train_env", "algorithm.bc_coef"):
-        assert words in line
+    _, renamed = migrate_config(TrainingConfig, yaml.safe_load(OLD_CONFIG), FORMAT)
+    assert line.startswith(f"{path}: written by an earlier release (practice is now train_env, ")
+    assert f"and {len(renamed) - 2} more" in line
 
 
 def test_an_old_and_a_new_name_together_are_refused(tmp_path):

@@ -45,7 +45,7 @@ def test_overrides_are_yaml_and_1e_3_is_a_number():
     ("text", "message"),
     [
         ("scenario:\n  n_vehicels: 3\n", r"scenario.n_vehicels is not a parameter; did you mean scenario.n_vehicles\?"),
-        ("gama: 0.9\n", r"gama is not a parameter; did you mean algorithm.gamma\?, in its group"),
+        ("gama: 0.9\n", r"gama is not a parameter; did you mean algorithm.gamma\? That is gamma in the group algorithm"),
         ("algorithm:\n  lr: 0.1\n", r"algorithm.lr is not a parameter; did you mean algorithm.learning_rate\?"),
         ("scenario: 3\n", "scenario = 3: a mapping"),
         ("algorithm:\n  gamma: 1.5\n", "gamma = 1.5"),
