@@ -309,11 +309,11 @@ def test_a_run_of_format_2_ends_as_the_release_that_began_it_ended_it(name, chec
     if same_machine(recorded):
         for key, value in expected.items():
             assert th.equal(ended[key], value), key
-    # On another machine rounding differs, and learning amplifies it: most of what was learned since is the same.
+    # On another machine rounding differs: up to that, what was learned since is the same.
     distance, learned = (
         sum(float((tensors[key] - expected[key]).square().sum()) for key in expected) ** 0.5 for tensors in (ended, start)
     )
-    assert distance < 0.7 * learned
+    assert distance < 0.01 * learned
     assert load_policy(folder / "final_model.zip").config == result.config
     assert load_config(TrainingConfig, folder / "config.yaml") == result.config  # without a warning: of the present format
     evaluations = np.load(folder / "evaluations.npz")
