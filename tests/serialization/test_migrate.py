@@ -144,7 +144,7 @@ def test_a_present_config_is_not_changed():
     assert migrate_config(TrainingConfig, values, FORMAT) == (values, [])
 
 
-def test_an_old_file_warns_once_and_means_the_same(tmp_path):
+def test_an_old_file_warns_in_one_line_and_means_the_same(tmp_path):
     path = tmp_path / "config.yaml"
     path.write_text(OLD_CONFIG)
     with pytest.warns(RenamedWarning) as warned:
@@ -152,23 +152,8 @@ def test_an_old_file_warns_once_and_means_the_same(tmp_path):
     assert config == TrainingConfig(**SAME_CONFIG)
     (line,) = [str(warning.message) for warning in warned]
     _, renamed = migrate_config(TrainingConfig, yaml.safe_load(OLD_CONFIG), FORMAT)
-    shown = [pair for pair in renamed if "{} is now {}".format(*pair) in line]
-    assert ("practice", "train_env") in shown
-    assert line.endswith(f"and {len(renamed) - len(shown)} more)")
-
-
-def test_an_old_file_with_few_old_names_names_them_all(tmp_path):
-    path = tmp_path / "config.yaml"
-    path.write_text("learner: {guidance: 0.0}\npractice: {teacher: orca}\n")
-    with pytest.warns(RenamedWarning) as warned:
-        load_config(TrainingConfig, path)
-    (line,) = [str(warning.message) for warning in warned]
-    for old, new in (
-        ("practice", "train_env"),
-        ("algorithm.guidance", "algorithm.bc_coef"),
-        ("train_env.teacher", "train_env.expert"),
-    ):
-        assert f"{old} is now {new}" in line
+    assert line.startswith(f"{path}: written by an earlier release (practice is now train_env, ")
+    assert f"and {len(renamed) - 2} more" in line
 
 
 def test_an_old_and_a_new_name_together_are_refused(tmp_path):
@@ -324,11 +309,11 @@ def test_a_run_of_format_2_ends_as_the_release_that_began_it_ended_it(name, chec
     if same_machine(recorded):
         for key, value in expected.items():
             assert th.equal(ended[key], value), key
-    # On another machine rounding differs, and learning amplifies it: most of what was learned since is the same.
+    # On another machine rounding differs: up to that, what was learned since is the same.
     distance, learned = (
         sum(float((tensors[key] - expected[key]).square().sum()) for key in expected) ** 0.5 for tensors in (ended, start)
     )
-    assert distance < 0.7 * learned
+    assert distance < 0.01 * learned
     assert load_policy(folder / "final_model.zip").config == result.config
     assert load_config(TrainingConfig, folder / "config.yaml") == result.config  # without a warning: of the present format
     evaluations = np.load(folder / "evaluations.npz")
