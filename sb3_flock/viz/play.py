@@ -35,7 +35,7 @@ _HELP = (
     "    an obstacle",
     "space: pause, dot: one step",
     "+ -: vehicles (+ at pointer)",
-    "v: observation of the next vehicle,",
+    "v: the next one's observation,",
     "    forward is up",
     "r: new episode",
     "q: quit",
