@@ -56,9 +56,9 @@ def test_the_tables_are_written_as_json(results):
 
 def test_a_folder_that_cannot_be_created_is_an_error_of_one_line(capsys, tmp_path):
     (tmp_path / "file").touch()
-    assert main(["reproduce", "--out", str(tmp_path / "file" / "x")]) == 2
+    assert main(["reproduce", "--output", str(tmp_path / "file" / "x")]) == 2
     errors = capsys.readouterr().err
-    assert f"out = {tmp_path / 'file' / 'x'}: " in errors
+    assert f"--output {tmp_path / 'file' / 'x'}: " in errors
     assert errors.count("\n") == 1
 
 

@@ -72,18 +72,11 @@ def test_a_controller_or_a_policy_becomes_a_controller(network):
     assert adapted.policy is network
 
 
-class ActsAlone:
-    """Has the method of a controller, without being one."""
-
-    def act(self, sensing, scenario):
-        raise AssertionError
-
-
 class PredictsNothing:
     predict = None
 
 
-@pytest.mark.parametrize("policy", [object(), ActsAlone(), PredictsNothing(), None, "ddpg-3v1o"])
+@pytest.mark.parametrize("policy", [object(), PredictsNothing(), None, "ddpg-3v1o"])
 def test_an_object_without_predict_is_refused_in_one_line(policy):
     needed = f"policy = {type(policy).__name__}: a Controller, or an object with SB3's predict, is needed"
     with pytest.raises(SettingsError) as error:
