@@ -15,9 +15,6 @@ from rich.text import Text
 from sb3_flock.evaluation.metrics import columns
 from sb3_flock.evaluation.report import add_short_columns, plain_table, short_cells
 
-_OTHER_COLUMNS = 54
-"""Width of all columns but the trials' names."""
-
 
 class TrialsTable(tune.Callback):
     """The running trials and those that ended last, with their latest evaluations.
@@ -85,7 +82,8 @@ class TrialsTable(tune.Callback):
 
     def _table(self, trials: list[Any]) -> Table:
         table = plain_table()
-        table.add_column("trial", no_wrap=True, overflow="ellipsis", max_width=max(12, self.console.width - _OTHER_COLUMNS))
+        others = sum(1 + len(heading) for heading in ("running", "done", *columns().values()))
+        table.add_column("trial", no_wrap=True, overflow="ellipsis", max_width=max(12, self.console.width - others - 1))
         for heading in ("state", "done"):
             table.add_column(heading, justify="right", no_wrap=True)
         add_short_columns(table)
