@@ -58,7 +58,7 @@ def plain_table() -> Table:
 def add_short_columns(table: Table) -> None:
     """Add the columns of narrow tables, those of :func:`~sb3_flock.evaluation.metrics.columns`."""
     for heading in columns().values():
-        table.add_column(heading, justify="right", no_wrap=True)
+        table.add_column(heading.replace(" ", "\n"), justify="right", no_wrap=True)
 
 
 def short_cells(means: Mapping[str, float | None], missing: str = "-") -> list[str]:

@@ -82,7 +82,7 @@ class TrialsTable(tune.Callback):
 
     def _table(self, trials: list[Any]) -> Table:
         table = plain_table()
-        others = sum(1 + len(heading) for heading in ("running", "done", *columns().values()))
+        others = sum(2 + max(map(len, heading.split())) for heading in ("running", "done", *columns().values()))
         table.add_column("trial", no_wrap=True, overflow="ellipsis", max_width=max(12, self.console.width - others - 3))
         for heading in ("state", "done"):
             table.add_column(heading, justify="right", no_wrap=True)
