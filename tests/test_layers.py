@@ -79,3 +79,14 @@ def test_every_module_has_a_layer_and_the_contract_has_no_exceptions(linter):
 def test_every_folder_with_modules_is_a_package():
     folders = {path.parent for path in (ROOT / "sb3_flock").rglob("*.py")}
     assert [folder for folder in folders if not (folder / "__init__.py").exists()] == []
+
+
+def test_each_module_has_a_test_of_its_name():
+    package = ROOT / "sb3_flock"
+    modules = [path.relative_to(package) for path in package.rglob("*.py") if not path.name.startswith("__")]
+    missing = [
+        str(module)
+        for module in modules
+        if not (ROOT / "tests" / module.parent / f"test_{module.name.lstrip('_')}").exists()
+    ]
+    assert missing == []
