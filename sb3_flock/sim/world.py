@@ -117,6 +117,7 @@ class World:
         self.scenario = scenario
         self.n_flocks = n_flocks
         self.sensors = Sensors(scenario)
+        self.steps = scenario.max_cycles  # no episode is running before the first reset
         self.action_low = np.array([0.0, -scenario.max_turn_rate])
         self.action_high = np.array([scenario.max_speed, scenario.max_turn_rate])
         # As large as the actions: NumPy broadcasts slowly along a last axis this short.
@@ -181,7 +182,7 @@ class World:
         :raises RuntimeError: before a reset or after the episode's last step
         """
         scenario = self.scenario
-        if not hasattr(self, "steps") or self.steps >= scenario.max_cycles:
+        if self.steps >= scenario.max_cycles:
             raise RuntimeError("no episode is running: call reset() first")
         clipped = np.clip(np.asarray(actions, dtype=np.float64), *self._bounds)
         dt = scenario.time_step
