@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
-from typing import Any
+import contextlib
+import re
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any
 
 from sb3_flock.cli import shared
 from sb3_flock.cli.parsing import Parser, add_command, listed, whole_number
-from sb3_flock.settings import SettingsError, field_of
+from sb3_flock.settings import RunError, SettingsError, field_of
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from sb3_flock.training.train import TrainingResult
 
 CONFIG_FLAGS: dict[str, tuple[tuple[str, ...], str]] = {
     "scenario.n_vehicles": (("--n-vehicles",), "N"),
@@ -89,24 +96,29 @@ def _overrides_of(options: argparse.Namespace) -> dict[str, Any]:
     return {**flags, **shared.overrides_of(options.set)}
 
 
-def run(options: argparse.Namespace, words: Sequence[str]) -> int:
-    """Train or resume, and print the table of the best policy and the run folder."""
+@contextlib.contextmanager
+def _resume_as_command() -> Iterator[Any]:
+    """A console for the training; where the library says that a folder can be resumed, it and errors show the command."""
     from rich.console import Console
 
-    console = Console(stderr=True)
-    # The training is imported after the config is read: a mistake in the config is reported without waiting for torch.
-    if options.resume is None:
-        config = config_of(options)
-        from sb3_flock.training.train import train
+    class CommandConsole(Console):
+        def print(self, *objects: Any, **kwargs: Any) -> None:
+            super().print(*(_as_command(line) if isinstance(line, str) else line for line in objects), **kwargs)
 
-        result = train(config, console, command=["sb3-flock", *words])
-    else:
-        if options.config is not None:
-            raise SettingsError("--resume and --config: the run folder has a config of its own")
-        changes = _overrides_of(options)
-        from sb3_flock.training.train import resume
+    try:
+        yield CommandConsole(stderr=True)
+    except RunError as error:
+        raise type(error)(_as_command(str(error))) from None
 
-        result = resume(options.resume, console, changes, command=["sb3-flock", *words])
+
+def _as_command(line: str) -> str:
+    return re.sub(r"; resume (.+) to continue$", r"; to continue: sb3-flock train --resume \1", line)
+
+
+def run(options: argparse.Namespace, words: Sequence[str]) -> int:
+    """Train or resume, and print the table of the best policy and the run folder."""
+    with _resume_as_command() as console:
+        result = _train_or_resume(options, words, console)
     from sb3_flock.serialization.load import load_policy
 
     policy = load_policy(result.best_model)
@@ -114,3 +126,18 @@ def run(options: argparse.Namespace, words: Sequence[str]) -> int:
     shared.evaluate_and_print(policy, str(policy.path), result.config.scenario, episodes, seed=0, console=console)
     print(result.folder)
     return 0
+
+
+def _train_or_resume(options: argparse.Namespace, words: Sequence[str], console: Console) -> TrainingResult:
+    # The training is imported after the config is read: a mistake in the config is reported without waiting for torch.
+    if options.resume is None:
+        config = config_of(options)
+        from sb3_flock.training.train import train
+
+        return train(config, console, command=["sb3-flock", *words])
+    if options.config is not None:
+        raise SettingsError("--resume and --config: the run folder has a config of its own")
+    changes = _overrides_of(options)
+    from sb3_flock.training.train import resume
+
+    return resume(options.resume, console, changes, command=["sb3-flock", *words])

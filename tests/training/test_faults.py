@@ -172,7 +172,7 @@ def test_a_signal_saves_first_and_prints_how_to_resume(tmp_path, start, number, 
     folder = tmp_path / "runs" / "ddpg_3v1o_1"
     steps = newest(folder).num_timesteps
     assert steps == run.position()  # nothing is lost
-    assert f"rl_model_{steps}_steps.zip is saved; resume {folder} to continue" in errors
+    assert f"rl_model_{steps}_steps.zip is saved; to continue: sb3-flock train --resume {folder}" in errors
     assert load_policy(folder).path.name in {"best_model.zip", f"rl_model_{steps}_steps.zip"}
     if number == signal.SIGINT:
         code, _, errors = start("--resume", folder, "--total-timesteps", steps + 60).end()
@@ -190,7 +190,7 @@ def test_a_full_disk_is_one_line_and_leaves_what_was_saved(tmp_path, start):
     assert "File too large" in last
     folder = tmp_path / "runs" / "ddpg_3v1o_1"
     whole = newest(folder)
-    assert f"{whole.path.name} is saved; resume {folder} to continue" in last
+    assert f"{whole.path.name} is saved; to continue: sb3-flock train --resume {folder}" in last
     assert not list(folder.glob("*.tmp")) + list(folder.glob(".*.tmp"))
     code, _, _ = start("--resume", folder, "--total-timesteps", whole.num_timesteps + 60).end()
     assert code == 0
@@ -223,7 +223,7 @@ def test_a_folder_that_turns_read_only_is_one_line_and_leaves_what_was_saved(tmp
     whole = newest(folder)
     last = errors.strip().splitlines()[-1]
     assert "Permission denied" in last
-    assert f"{whole.path.name} is saved; resume {folder} to continue" in last
+    assert f"{whole.path.name} is saved; to continue: sb3-flock train --resume {folder}" in last
     code, _, errors = start("--resume", folder, limit=obey_permissions).end()
     assert code == 1
     assert "Permission denied" in errors.strip().splitlines()[-1]
