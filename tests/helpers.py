@@ -8,6 +8,9 @@ import torch as th
 from rich.console import Console
 
 from sb3_flock import FlockCNN, TrainingConfig, flocking_v0
+from sb3_flock.controllers import EXPERTS
+from sb3_flock.envs.expert_env import ExpertEnv
+from sb3_flock.envs.vec_env import flatten
 from sb3_flock.evaluation.rollout import rollout_batch
 from sb3_flock.serialization.load import checkpoint_paths
 from sb3_flock.serialization.yaml_io import load_config
@@ -108,3 +111,8 @@ def same_machine(recorded):
 def recorded_machine():
     """The ``runtime_info`` with which the files in :data:`DATA` were made, as a checkpoint among them has it."""
     return LoadedCheckpoint(DATA / "format_2/runs/ddpg/rl_model_400_steps.zip", 10**8).runtime_info
+
+
+def expert_vec_env(scenario):
+    """Two flocks whose expert is ORCA, queried in every step, as a vector env."""
+    return flatten(ExpertEnv(scenario, lambda world: EXPERTS["orca"](world, None), 0.5, 0.1, queries=True), 2, seed=0)

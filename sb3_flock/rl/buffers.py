@@ -116,6 +116,28 @@ class CompactReplayBuffer(ReplayBuffer):
             )
         super().add(obs, next_obs, action, reward, done, infos)
 
+    def draw(self, batch_size: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Draw a minibatch: row and env of each transition, each ``(batch,)``, from NumPy's global stream as SB3 does."""
+        if self.full:  # the row before the newest one has lost its next observation
+            rows = (np.random.randint(1, self.buffer_size, size=batch_size) + self.pos) % self.buffer_size  # noqa: NPY002
+        else:
+            rows = np.random.randint(0, self.pos, size=batch_size)  # noqa: NPY002
+        return rows, np.random.randint(0, high=self.n_envs, size=(batch_size,))  # noqa: NPY002
+
+    def last_observations(
+        self, rows: NDArray[np.int64], envs: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.float16]]:
+        """The next observations of transitions that ended an episode, which are stored outside the rows.
+
+        :return: for each transition its row in the second array, or -1; ``(ends, pixels)``
+        """
+        index, last = np.full(rows.shape, -1, np.int64), []
+        for place in zip(*np.nonzero(self.dones[rows, envs]), strict=True):
+            index[place] = len(last)
+            last.append(self._last_observations[rows[place]][envs[place]].reshape(-1))
+        pixels = int(np.prod(self.observations.shape[2:]))
+        return index, np.array(last, dtype=np.float16).reshape(-1, pixels)
+
     def _get_samples(  # type: ignore[override]
         self, batch_inds: NDArray[np.int64], env: VecNormalize | None = None
     ) -> ReplayBufferSamples | ExpertReplayBufferSamples:

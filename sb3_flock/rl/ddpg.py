@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from torch.nn import functional as F  # noqa: N812 - torch's name for it
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from sb3_flock._renamed import FIELDS, warn_renamed
+from sb3_flock.rl.compiled_update import CompiledUpdate, can_compile
 from sb3_flock.rl.torch_layers import FlockCNN
 from sb3_flock.settings import SettingsError
 
@@ -29,14 +31,15 @@ class FlockDDPG(DDPG):
     The other parameters are those of SB3's ``DDPG``. Every features extractor must be a :class:`FlockCNN`.
     """
 
-    def __init__(self, *args: Any, bc_coef: float = 0.0, **kwargs: Any) -> None:
+    def __init__(self, *args: Any, bc_coef: float = 0.0, compiled: bool | None = None, **kwargs: Any) -> None:
         for old, new in FIELDS["FlockDDPG"].items():  # arguments of the previous release
             if old in kwargs:
                 if bc_coef:
                     raise TypeError(f"FlockDDPG got {new} and its old name {old}")
                 warn_renamed(f"FlockDDPG: {old}", new)
                 bc_coef = kwargs.pop(old)
-        self.bc_coef = bc_coef
+        self.bc_coef, self.compiled = bc_coef, compiled
+        self._update: CompiledUpdate | None = None
         super().__init__(*args, **kwargs)
 
     def _setup_model(self) -> None:
@@ -56,10 +59,23 @@ class FlockDDPG(DDPG):
                 f"bc_coef = {self.bc_coef}: a CompactReplayBuffer with store_expert_actions=True is needed, or bc_coef 0"
             )
 
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_update"]
+
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
         """Update the networks from the replay buffer (Algorithm 1 of the paper; one target network each)."""
         self.policy.set_training_mode(True)
         self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
+        if self.compiled is not False and can_compile(self):
+            self._update = self._update or CompiledUpdate(self)
+            losses = self._update(gradient_steps, batch_size, self._n_updates, self.bc_coef)
+            self._n_updates += gradient_steps
+            self._log_losses(*losses.T[:2], losses[:, 2] if self.bc_coef else ())
+        else:
+            self._train_by_torch(gradient_steps, batch_size)
+
+    def _train_by_torch(self, gradient_steps: int, batch_size: int) -> None:
+        """The reference of the compiled update."""
         extractor: FlockCNN = self.critic.features_extractor  # type: ignore[assignment]
         actor, critic = list(self.actor.parameters()), list(self.critic.parameters())
         targets = list(self.actor_target.parameters()) + list(self.critic_target.parameters())
@@ -92,11 +108,15 @@ class FlockDDPG(DDPG):
             critic_losses.append(critic_loss.detach())
             actor_losses.append(actor_loss.detach())
 
+        self._log_losses(
+            *(th.stack(losses).tolist() if losses else () for losses in (critic_losses, actor_losses, bc_losses))
+        )
+
+    def _log_losses(self, critic: Sequence[float], actor: Sequence[float], bc: Sequence[float]) -> None:
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        self.logger.record("train/actor_loss", np.mean(th.stack(actor_losses).tolist()))
-        self.logger.record("train/critic_loss", np.mean(th.stack(critic_losses).tolist()))
-        if bc_losses:
-            self.logger.record("train/bc_loss", np.mean(th.stack(bc_losses).tolist()))
+        for name, losses in (("actor", actor), ("critic", critic), ("bc", bc)):
+            if len(losses):
+                self.logger.record(f"train/{name}_loss", np.mean(losses))
 
 
 def _step(optimizer: th.optim.Optimizer, loss: th.Tensor, parameters: list[th.nn.Parameter]) -> None:

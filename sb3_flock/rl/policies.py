@@ -68,11 +68,7 @@ class _InvertingClamp(th.autograd.Function):
         (raw,) = ctx.saved_tensors
         # Descent along a negative gradient raises the output: then the upper bound counts.
         room = th.where(gradient < 0, 1.0 - raw, 1.0 + raw)
-        return gradient * (room / _MARGIN).clamp(-1.0, 1.0)
-
-
-_MARGIN = 0.1
-"""Distance from the bound at which an outward gradient starts to shrink."""
+        return gradient * (room / InvertingBound.MARGIN).clamp(-1.0, 1.0)
 
 
 class InvertingBound(nn.Module):
@@ -81,6 +77,9 @@ class InvertingBound(nn.Module):
     A tanh saturates in this task: standing still is a bound of the speed, the tanh's input goes to -10 and beyond, and its
     gradient vanishes. This bound is reached exactly, and left as soon as the critic's gradient points inwards.
     """
+
+    MARGIN = 0.1
+    """Distance from the bound at which an outward gradient starts to shrink."""
 
     def forward(self, raw: th.Tensor) -> th.Tensor:
         """Bounded actions, of the input's shape."""
