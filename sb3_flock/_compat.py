@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 INHERITED = {
-    "stable_baselines3.DDPG": ("_setup_model", "_update_learning_rate", "_n_updates"),
+    "stable_baselines3.DDPG": ("_setup_model", "_excluded_save_params", "_update_learning_rate", "_n_updates"),
     "stable_baselines3.common.buffers.ReplayBuffer": ("_get_samples",),
     "stable_baselines3.td3.policies.TD3Policy": ("_get_constructor_parameters", "_update_features_extractor"),
     "stable_baselines3.sac.policies.SACPolicy": ("_get_constructor_parameters", "_update_features_extractor"),

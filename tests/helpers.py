@@ -15,7 +15,7 @@ from sb3_flock.evaluation.rollout import rollout_batch
 from sb3_flock.serialization.load import checkpoint_paths
 from sb3_flock.serialization.yaml_io import load_config
 from sb3_flock.sim import World, episode_rng
-from sb3_flock.training.checkpoint import LoadedCheckpoint, runtime_info
+from sb3_flock.training.checkpoint import LoadedCheckpoint
 
 TINY = {
     "total_timesteps": 300, "n_flocks": 2, "eval_freq": 120, "n_eval_episodes": 2, "save_freq": 150, "max_cycles": 20,
@@ -100,17 +100,6 @@ def flat(tree, name=""):
 
 DATA = Path(__file__).parent / "data"
 """Files of earlier releases, and what those releases computed with them."""
-
-
-def same_machine(recorded):
-    """Whether this machine gives the bits that were computed with a recorded ``runtime_info``."""
-    now = runtime_info(TrainingConfig())
-    return all(recorded[name] == now[name] for name in recorded if name != "sb3_flock")
-
-
-def recorded_machine():
-    """The ``runtime_info`` with which the files in :data:`DATA` were made, as a checkpoint among them has it."""
-    return LoadedCheckpoint(DATA / "format_2/runs/ddpg/rl_model_400_steps.zip", 10**8).runtime_info
 
 
 def expert_vec_env(scenario):

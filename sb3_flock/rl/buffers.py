@@ -131,7 +131,7 @@ class CompactReplayBuffer(ReplayBuffer):
 
         :return: for each transition its row in the second array, or -1; ``(ends, pixels)``
         """
-        index, last = np.full(rows.shape, -1, np.int64), []
+        index, last = np.full(rows.shape, -1, np.int64), list[NDArray[np.float16]]()
         for place in zip(*np.nonzero(self.dones[rows, envs]), strict=True):
             index[place] = len(last)
             last.append(self._last_observations[rows[place]][envs[place]].reshape(-1))

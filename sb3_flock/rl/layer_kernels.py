@@ -1,11 +1,13 @@
 """Layers of the networks, forward and backward, compiled by numba: twins of torch's layers, tested against them.
 
 Matrices are ``(rows, columns)`` float32 and contiguous. Matrix products go to BLAS; everything around a product is one loop.
+Images are channels last: the numbers under one row of a kernel stand side by side.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -16,34 +18,49 @@ Indices = NDArray[np.int64]
 
 ZERO, ONE = np.float32(0), np.float32(1)
 _NORM_EPSILON = np.float32(1e-5)
-_HALF_SCALE = np.float32(2.0**112)
+_UNPACKED = 1_000_000
+"""Multiplications of the largest product that OpenBLAS does without packing its factors first, with AVX-512."""
+_SMALLEST_NORMAL_HALF = np.float32(2.0**-14)
+
+_kernel: Any = njit(error_model="numpy", cache=True, fastmath={"reassoc", "contract", "nsz"})
+"""Sums may be reordered, so that they use the vector units; NaN and infinity stay what they are."""
 
 
-@njit(error_model="numpy", cache=True)
+@_kernel
 def matrix(memory: Array, offset: int, rows: int, columns: int) -> Array:
     """A part of flat memory as a matrix."""
     return memory[offset : offset + rows * columns].reshape(rows, columns)
 
 
-@njit(error_model="numpy", cache=True)
+@_kernel
 def product(a: Array, b: Array, out: Array) -> None:
-    """a b."""
+    """The product a b."""
     np.dot(a, b, out)
 
 
-@njit(error_model="numpy", cache=True)
+@_kernel
 def product_transposed(a: Array, b: Array, out: Array) -> None:
-    """a b^T."""
+    """The product a b^T."""
     np.dot(a, b.T, out)
 
 
-@njit(error_model="numpy", cache=True)
+@_kernel
 def transposed_product(a: Array, b: Array, out: Array) -> None:
-    """a^T b."""
-    np.dot(a.T, b, out)
+    """The product a^T b; tall matrices in blocks, of which each product is small enough for OpenBLAS to be fast."""
+    block = _UNPACKED // (a.shape[1] * b.shape[1])
+    if block < 128 or block >= len(a):
+        np.dot(a.T, b, out)
+        return
+    part = np.empty_like(out)
+    out[:] = 0
+    for start in range(0, len(a), block):
+        np.dot(a[start : start + block].T, b[start : start + block], part)
+        for i in range(out.shape[0]):
+            for j in range(out.shape[1]):
+                out[i, j] += part[i, j]
 
 
-@njit(error_model="numpy", cache=True)
+@_kernel
 def add_bias(out: Array, bias: Array) -> None:
     """Add a bias to every row."""
     for i in range(out.shape[0]):
@@ -51,7 +68,7 @@ def add_bias(out: Array, bias: Array) -> None:
             out[i, j] += bias[j]
 
 
-@njit(error_model="numpy", cache=True)
+@_kernel
 def bias_relu(out: Array, bias: Array) -> None:
     """Add a bias to every row, then ReLU."""
     for i in range(out.shape[0]):
@@ -59,7 +76,7 @@ def bias_relu(out: Array, bias: Array) -> None:
             out[i, j] = max(out[i, j] + bias[j], ZERO)
 
 
-@njit(error_model="numpy", cache=True)
+@_kernel
 def relu_backward(gradient: Array, out: Array) -> None:
     """The gradient in front of a ReLU, in place, from that behind it and its output."""
     for i in range(out.shape[0]):
@@ -67,7 +84,7 @@ def relu_backward(gradient: Array, out: Array) -> None:
             gradient[i, j] = gradient[i, j] if out[i, j] > 0 else ZERO
 
 
-@njit(error_model="numpy", cache=True)
+@_kernel
 def sum_rows(gradient: Array, out: Array) -> None:
     """The gradient of a bias."""
     out[:] = 0
@@ -76,7 +93,7 @@ def sum_rows(gradient: Array, out: Array) -> None:
             out[j] += gradient[i, j]
 
 
-@njit(error_model="numpy", cache=True)
+@_kernel
 def norm_relu(z: Array, bias: Array, weight: Array, norm_bias: Array, normed: Array, scale: Array, out: Array) -> None:
     """Bias, layer norm and ReLU; ``normed`` and ``scale`` are kept for the backward pass."""
     n, width = z.shape
@@ -95,7 +112,7 @@ def norm_relu(z: Array, bias: Array, weight: Array, norm_bias: Array, normed: Ar
             out[i, j] = max(normed[i, j] * weight[j] + norm_bias[j], ZERO)
 
 
-@njit(error_model="numpy", cache=True)
+@_kernel
 def norm_relu_backward(
     gradient: Array, weight: Array, normed: Array, scale: Array, out: Array, d_weight: Array, d_norm_bias: Array
 ) -> None:
@@ -119,7 +136,7 @@ def norm_relu_backward(
             gradient[i, j] = (gradient[i, j] - mean - normed[i, j] * product_mean) * scale[i]
 
 
-@njit(error_model="numpy", cache=True)
+@_kernel
 def inverting_bound_backward(gradient: Array, raw: Array, margin: float) -> None:
     """The gradient in front of :class:`~sb3_flock.rl.policies.InvertingBound`, in place."""
     for i in range(raw.shape[0]):
@@ -128,7 +145,7 @@ def inverting_bound_backward(gradient: Array, raw: Array, margin: float) -> None
             gradient[i, j] *= min(max(room / np.float32(margin), -ONE), ONE)
 
 
-@njit(error_model="numpy", cache=True)
+@_kernel
 def tanh_backward(gradient: Array, out: Array) -> None:
     """The gradient in front of a tanh, in place."""
     for i in range(out.shape[0]):
@@ -136,30 +153,34 @@ def tanh_backward(gradient: Array, out: Array) -> None:
             gradient[i, j] *= ONE - out[i, j] * out[i, j]
 
 
-@njit(error_model="numpy", cache=True)
-def gather_rows(out: Array, below: Array, taps: Indices, batch: int, channels: int) -> None:
-    """The patches of a convolution, ``batch * taps * channels``, from the layer below, ``batch * positions * channels``."""
-    n_taps, n_below = len(taps), len(below) // (batch * channels)
-    for b in range(batch):
-        for t in range(n_taps):
-            to, at = (b * n_taps + t) * channels, (b * n_below + taps[t]) * channels
-            for c in range(channels):
-                out[to + c] = below[at + c]
+@_kernel
+def gather_patches(patches: Array, images: Array, starts: Indices, run: int) -> None:
+    """The inputs of every kernel position of a convolution, from the layer below.
+
+    :param patches: ``(batch, rows of kernels * run)``, filled
+    :param images: ``(batch, positions below * channels)``
+    :param starts: where each row of each kernel position starts in an image
+    :param run: numbers under one row of a kernel: its side times the channels
+    """
+    for b in range(len(images)):
+        patch, image = patches[b], images[b]
+        for t in range(len(starts)):
+            for c in range(run):
+                patch[t * run + c] = image[starts[t] + c]
 
 
-@njit(error_model="numpy", cache=True)
-def scatter_rows(gradient: Array, below: Array, taps: Indices, batch: int, channels: int) -> None:
-    """The backward pass of :func:`gather_rows`."""
-    n_taps, n_below = len(taps), len(below) // (batch * channels)
-    below[:] = 0
-    for b in range(batch):
-        for t in range(n_taps):
-            at, to = (b * n_taps + t) * channels, (b * n_below + taps[t]) * channels
-            for c in range(channels):
-                below[to + c] += gradient[at + c]
+@_kernel
+def scatter_patches(gradient: Array, images: Array, starts: Indices, run: int) -> None:
+    """The backward pass of :func:`gather_patches`: from the gradient of the patches to that of the images."""
+    for b in range(len(images)):
+        patch, image = gradient[b], images[b]
+        image[:] = 0
+        for t in range(len(starts)):
+            for c in range(run):
+                image[starts[t] + c] += patch[t * run + c]
 
 
-@njit(error_model="numpy", cache=True)
+@_kernel
 def swap_inner(kernel: Array, out: Array, n_out: int, outer: int, inner: int) -> None:
     """``(n_out, outer, inner)`` to ``(n_out, inner, outer)``, both flat."""
     for o in range(n_out):
@@ -168,64 +189,51 @@ def swap_inner(kernel: Array, out: Array, n_out: int, outer: int, inner: int) ->
                 out[(o * inner + b) * outer + a] = kernel[(o * outer + a) * inner + b]
 
 
-@njit(error_model="numpy", cache=True)
-def gather_patches(
-    patches: Array,
-    observations: NDArray[np.uint16],
-    rows: Indices,
-    envs: Indices,
-    separate: NDArray[np.uint16],
-    separate_index: Indices,
-    taps: Indices,
-    mirrored_taps: Indices,
-    n_mirrored: int,
-) -> None:
-    """The first convolution's patches of a minibatch, straight from the replay buffer in half precision.
+@_kernel
+def read_image(image: Array, half: NDArray[np.uint16], channels: int, side: int, is_mirrored: bool) -> None:
+    """An observation in half precision as an image in single precision, exactly.
 
-    :param patches: ``(batch * positions, channels * kernel_size^2)``, filled
-    :param observations: bits of the float16 observations, ``(rows, envs, pixels)``
-    :param rows: row of each sample in the buffer, taken modulo its length
-    :param envs: env of each sample
-    :param separate: observations stored outside the rows, ``(any, pixels)``
-    :param separate_index: for each sample its row there, or -1
-    :param taps: pixel of each entry of a sample's patches
-    :param mirrored_taps: the same, left for right, for the first ``n_mirrored`` samples
+    :param image: ``(positions * channels,)``, filled
+    :param half: bits of the float16 observation, ``(channels * positions,)``
+    :param is_mirrored: left for right
     """
-    pixels, n_rows = observations.shape[2], observations.shape[0]
-    bits = np.empty(pixels, np.uint32)
-    values = bits.view(np.float32)
-    flat = patches.reshape(len(rows), len(taps))
-    for b in range(len(rows)):
-        if separate_index[b] >= 0:
-            half = separate[separate_index[b]]
-        else:
-            half = observations[rows[b] % n_rows, envs[b]]
-        for i in range(pixels):  # exact for every finite number: the exponent's bias is corrected by a product
-            h = np.uint32(half[i])
-            bits[i] = ((h & np.uint32(0x7FFF)) << np.uint32(13)) | ((h & np.uint32(0x8000)) << np.uint32(16))
-        for i in range(pixels):
-            values[i] *= _HALF_SCALE
-        if b < n_mirrored:
-            for j in range(len(taps)):
-                flat[b, j] = values[mirrored_taps[j]]
-        else:
-            for j in range(len(taps)):
-                flat[b, j] = values[taps[j]]
+    area, u32 = side * side, np.uint32
+    values = np.empty(len(half), np.float32)
+    bits = values.view(np.uint32)
+    for i in range(len(half)):
+        magnitude = (u32(half[i]) & u32(0x7FFF)) << u32(13)
+        bits[i] = magnitude + (u32(113 << 23) if magnitude < u32(1 << 23) else u32(112 << 23))
+    for i in range(len(half)):
+        # A subnormal half was read as if it were the smallest normal one plus itself.
+        value = values[i] - (_SMALLEST_NORMAL_HALF if half[i] & u32(0x7C00) == 0 else ZERO)
+        values[i] = -value if half[i] & u32(0x8000) else value
+    for c in range(channels):
+        for y in range(side):
+            row = values[c * area + y * side : c * area + (y + 1) * side]
+            for x in range(side):
+                image[(y * side + (side - 1 - x if is_mirrored else x)) * channels + c] = row[x]
 
 
-@njit(error_model="numpy", cache=True)
-def adam(parameters: Array, mean: Array, square: Array, gradient: Array, learning_rate: float, step: int) -> None:
-    """One step of Adam with torch's default coefficients, in place; ``step`` counts from 1."""
+@_kernel
+def adam(
+    parameters: Array, mean: Array, square: Array, first: Array, second: Array, learning_rate: float, step: int
+) -> None:
+    """One step of Adam with torch's default coefficients, in place.
+
+    :param first: a gradient, to which ``second`` is added
+    :param step: counts from 1
+    """
     size = np.float32(learning_rate / (1.0 - 0.9**step))
     root = np.float32(math.sqrt(1.0 - 0.999**step))
     rest1, beta2, rest2, epsilon = np.float32(0.1), np.float32(0.999), np.float32(0.001), np.float32(1e-8)
     for i in range(len(parameters)):
-        mean[i] += (gradient[i] - mean[i]) * rest1
-        square[i] = square[i] * beta2 + gradient[i] * gradient[i] * rest2
+        gradient = first[i] + second[i]
+        mean[i] += (gradient - mean[i]) * rest1
+        square[i] = square[i] * beta2 + gradient * gradient * rest2
         parameters[i] -= size * mean[i] / (np.sqrt(square[i]) / root + epsilon)
 
 
-@njit(error_model="numpy", cache=True)
+@_kernel
 def polyak(target: Array, online: Array, tau: float) -> None:
     """Move a target network towards the network that it follows, in place."""
     share = np.float32(tau)

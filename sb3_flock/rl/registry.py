@@ -84,7 +84,7 @@ _FLOCK_POLICY, _BOUNDS = "sb3_flock.rl.policies:FlockPolicy", ("inverting", "tan
 ALGORITHMS: dict[str, AlgorithmSpec] = {
     "ddpg": AlgorithmSpec("sb3_flock.rl.ddpg:FlockDDPG", _FLOCK_POLICY, action_bounds=_BOUNDS, has_bc=True),
     "ddpg-sb3": AlgorithmSpec("stable_baselines3:DDPG", _FLOCK_POLICY, action_bounds=_BOUNDS, has_compact_buffer=False),
-    "td3": AlgorithmSpec("stable_baselines3:TD3", _FLOCK_POLICY, action_bounds=_BOUNDS),
+    "td3": AlgorithmSpec("sb3_flock.rl.ddpg:FlockTD3", _FLOCK_POLICY, action_bounds=_BOUNDS),
     "sac": AlgorithmSpec("stable_baselines3:SAC", "sb3_flock.rl.policies:FlockSACPolicy", has_action_noise=False),
 }
 """The algorithms by the value of ``algo``."""

@@ -46,7 +46,7 @@ class FlockCNN(BaseFeaturesExtractor):
             raise SettingsError(f"FlockCNN needs observations of shape (channels, l, l), not {observation_space.shape}")
         super().__init__(observation_space, features_dim)
         in_channels, side, _ = observation_space.shape
-        self._in_channels = in_channels
+        self.input_shape: tuple[int, int, int] = observation_space.shape
         layers: list[nn.Module] = []
         for layer, out_channels in enumerate(channels):
             if kernel_size > side:
@@ -72,7 +72,7 @@ class FlockCNN(BaseFeaturesExtractor):
         :return: ``(batch, positions * kernel_size^2, channels)``, which :meth:`forward` takes, too
         """
         numbers = observations.flatten(1).index_select(1, self._taps0)  # type: ignore[arg-type]
-        return numbers.view(len(observations), -1, self._in_channels)
+        return numbers.view(len(observations), -1, self.input_shape[0])
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         """``(batch, channels, l, l)``, or the :meth:`patches` of it, to ``(batch, features_dim)``."""

@@ -1,16 +1,20 @@
 """The update of DDPG and TD3 as one function, compiled by numba: the twin of SB3's, tested against it.
 
 The parameters of a network are one flat array in the order of ``module.parameters()``; torch's modules are views of it.
+
+A minibatch is two halves, whose gradients are added. Two threads compute one half each; one thread computes one after the
+other and ends at the same bits.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from sb3_flock.rl.barrier_kernels import new_barrier, wait_for_other  # noqa: F401 - the caller makes the barrier
 from sb3_flock.rl.layer_kernels import (
     ONE,
     ZERO,
@@ -20,7 +24,6 @@ from sb3_flock.rl.layer_kernels import (
     add_bias,
     bias_relu,
     gather_patches,
-    gather_rows,
     inverting_bound_backward,
     matrix,
     norm_relu,
@@ -28,26 +31,35 @@ from sb3_flock.rl.layer_kernels import (
     polyak,
     product,
     product_transposed,
+    read_image,
     relu_backward,
-    scatter_rows,
+    scatter_patches,
     sum_rows,
     swap_inner,
     tanh_backward,
     transposed_product,
 )
 
+HALVES = 2
+
+_options: dict[str, Any] = {"error_model": "numpy", "cache": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+_kernel = njit(**_options)
+"""For functions that only compiled code calls: without wrappers for Python they compile twice as fast."""
+
 
 class Shapes(NamedTuple):
     """Shapes of the networks and of a minibatch."""
 
     batch: int
+    channels: int
+    """Channels of an observation."""
+    side: int
+    """Anchors along a side of an observation."""
+    kernel_size: int
     convolutions: Indices
-    """A row for each convolution: output channels, inputs of a kernel, positions, input channels."""
-    first_taps: Indices
-    """Pixel of each entry of an observation's patches, ``(positions * channels * kernel_size^2,)``."""
-    mirrored_taps: Indices
-    taps: Indices
-    """For each further convolution the positions below under every kernel position, flat, filled up with zeros."""
+    """A row for each convolution: output channels, input channels, positions, numbers in an image below."""
+    starts: Indices
+    """For each convolution where each row of each kernel position starts in an image below, filled up with zeros."""
     features: int
     has_norm: bool
     actor_widths: Indices
@@ -57,28 +69,34 @@ class Shapes(NamedTuple):
     action_layer: int
     is_inverting: bool
     bound_margin: float
+    at_head: int
+    """Where a network's parameters behind the features extractor start."""
+    at_actions: int
+    """Where the parameters of the critics' action layers start."""
 
 
 class Learned(NamedTuple):
-    """A network that an optimizer changes, all arrays flat and alike."""
+    """A network that an optimizer changes."""
 
     parameters: Array
-    gradient: Array
     mean: Array
     square: Array
     target: Array
     """The target network's parameters."""
+    gradients: Array
+    """``(2, parameters)``, one row for each half of a minibatch."""
 
 
 class Replay(NamedTuple):
     """The arrays of a :class:`~sb3_flock.rl.buffers.CompactReplayBuffer`."""
 
     observations: NDArray[np.uint16]
-    """Bits of the float16 observations, ``(rows, envs, pixels)``."""
+    """Bits of the float16 observations, ``(rows, envs, numbers)``."""
     actions: Array
     rewards: Array
-    ends: Array
-    """1 where an episode ended for another reason than its time limit."""
+    dones: Array
+    timeouts: Array
+    """1 where an episode ended by its time limit."""
     expert_actions: Array
 
 
@@ -92,110 +110,152 @@ class Batches(NamedTuple):
     last: NDArray[np.uint16]
     noise: Array
     """Noise on the target actions, ``(updates, batch, actions)``; empty for none."""
+    n_mirrored: int
+    """Samples at the start of a minibatch that are mirrored, left for right."""
 
 
-class Trace(NamedTuple):
-    """Memory of one extractor's forward or backward pass."""
+class Rule(NamedTuple):
+    """What an update does besides gradients."""
 
+    gamma: float
+    tau: float
+    bc_coef: float
+    actor_learning_rate: float
+    critic_learning_rate: float
+
+
+class Workspace(NamedTuple):
+    """Memory of each half of a minibatch, a row for each; what ends in ``back`` holds gradients."""
+
+    images: Array
+    patches: Array
+    next_patches: Array
     inputs: Array
+    inputs_back: Array
     outputs: Array
+    outputs_back: Array
     kernels: Array
-    z: Array
+    dense: Array
     normed: Array
     scale: Array
     features: Array
+    features_back: Array
+    hidden: Array
+    hidden_back: Array
+    critic_hidden: Array
+    joined: Array
+    joined_back: Array
+    action_layer: Array
+    actions: Array
+    """Those of the replay buffer."""
+    expert: Array
+    chosen: Array
+    """Those of the actor or of its target."""
+    raw: Array
+    """The same in front of the action bound."""
+    raw_back: Array
+    value: Array
+    value_back: Array
+    target: Array
+    losses: NDArray[np.float64]
+    """Sums over the half: critic, actor and behavior cloning loss."""
 
 
-@njit(error_model="numpy", cache=True)
-def _convolution(shapes: Shapes, layer: int) -> tuple[int, int, int, int]:
-    """Output channels, inputs of a kernel, positions and input channels of a convolution."""
-    row = shapes.convolutions[layer]
-    return row[0], row[1], row[2], row[3]
+@_kernel
+def _half(half: int, count: int) -> tuple[int, int]:
+    """Where a half of so many things starts and stops."""
+    middle = (count + 1) // HALVES
+    return (0, middle) if half == 0 else (middle, count)
 
 
-@njit(error_model="numpy", cache=True)
-def _extract(patches: Array, w: Array, shapes: Shapes, trace: Trace, features: Array) -> None:
-    """The features extractor's forward pass."""
-    batch, width = shapes.batch, shapes.features
+@_kernel
+def _extract(half: int, n: int, patches: Array, w: Array, shapes: Shapes, ws: Workspace, features: Array) -> None:
+    """The features extractor's forward pass over ``n`` samples."""
     at, at_in, at_out, below = 0, 0, 0, 0
     for layer in range(len(shapes.convolutions)):
-        channels, k, positions, channels_below = _convolution(shapes, layer)
-        rows, n_taps = batch * positions, k // channels_below
-        out = matrix(trace.outputs, at_out, rows, channels)
-        if layer == 0:
-            product_transposed(patches, matrix(w, at, channels, k), out)
-        else:
-            kernel = trace.kernels[at : at + channels * k]
-            swap_inner(w[at : at + channels * k], kernel, channels, channels_below, n_taps)
-            inputs = trace.inputs[at_in : at_in + rows * k]
-            gather_rows(inputs, trace.outputs[below:at_out], shapes.taps[layer, : positions * n_taps], batch, channels_below)
-            product_transposed(inputs.reshape(rows, k), kernel.reshape(channels, k), out)
+        channels, channels_below, positions, size_below = shapes.convolutions[layer]
+        area = shapes.kernel_size * shapes.kernel_size
+        k, rows = area * channels_below, n * positions
+        out = matrix(ws.outputs[half], at_out, rows, channels)
+        kernel = ws.kernels[half, at : at + channels * k]
+        swap_inner(w[at : at + channels * k], kernel, channels, channels_below, area)
+        inputs = patches
+        if layer:
+            inputs = ws.inputs[half, at_in : at_in + rows * k]
+            starts = shapes.starts[layer, : positions * shapes.kernel_size]
+            images = matrix(ws.outputs[half], below, n, size_below)
+            gather_patches(inputs.reshape(n, positions * k), images, starts, shapes.kernel_size * channels_below)
             at_in += rows * k
+        product_transposed(inputs.reshape(rows, k), kernel.reshape(channels, k), out)
         bias_relu(out, w[at + channels * k : at + channels * (k + 1)])
         at += channels * (k + 1)
         below, at_out = at_out, at_out + rows * channels
-    flat = trace.outputs[below:at_out].reshape(batch, (at_out - below) // batch)
-    n = width * flat.shape[1]
-    product_transposed(flat, matrix(w, at, width, flat.shape[1]), trace.z)
-    bias = w[at + n : at + n + width]
+    width, size = shapes.features, (at_out - below) // n
+    dense, normed = matrix(ws.dense[half], 0, n, width), matrix(ws.normed[half], 0, n, width)
+    product_transposed(matrix(ws.outputs[half], below, n, size), matrix(w, at, width, size), dense)
+    at += width * size
+    bias = w[at : at + width]
     if shapes.has_norm:
-        at += n + width
-        norm_relu(trace.z, bias, w[at : at + width], w[at + width : at + 2 * width], trace.normed, trace.scale, features)
+        norm, norm_bias = w[at + width : at + 2 * width], w[at + 2 * width : at + 3 * width]
+        norm_relu(dense, bias, norm, norm_bias, normed, ws.scale[half], features)
     else:
-        bias_relu(trace.z, bias)
-        features[:] = trace.z
+        bias_relu(dense, bias)
+        for i in range(n):
+            for j in range(width):
+                features[i, j] = dense[i, j]
 
 
-@njit(error_model="numpy", cache=True)
+@_kernel
 def _extract_backward(
-    gradient: Array, patches: Array, w: Array, g: Array, shapes: Shapes, trace: Trace, features: Array, back: Trace
+    half: int, n: int, gradient: Array, patches: Array, w: Array, g: Array, shapes: Shapes, ws: Workspace, features: Array
 ) -> None:
     """Its backward pass; ``gradient`` of the features is overwritten, the parameters' goes to ``g``."""
-    batch, width, n_layers = shapes.batch, shapes.features, len(shapes.convolutions)
-    at, at_in, at_out, last = 0, 0, 0, 0
-    for layer in range(n_layers):
-        channels, k, positions, _ = _convolution(shapes, layer)
-        at += channels * (k + 1)
-        at_in += batch * positions * k if layer else 0
-        last = batch * positions * channels
-        at_out += last
-    flat = trace.outputs[at_out - last : at_out].reshape(batch, last // batch)
-    bias = at + width * flat.shape[1]
+    width, area = shapes.features, shapes.kernel_size * shapes.kernel_size
+    at, at_in, at_out, size = 0, 0, 0, 0
+    for layer in range(len(shapes.convolutions)):
+        channels, channels_below, positions, _ = shapes.convolutions[layer]
+        at += channels * (area * channels_below + 1)
+        at_in += n * positions * area * channels_below if layer else 0
+        size = positions * channels
+        at_out += n * size
+    bias = at + width * size
     if shapes.has_norm:
         norm, norm_bias = bias + width, bias + 2 * width
         d_norm, d_norm_bias = g[norm:norm_bias], g[norm_bias : norm_bias + width]
-        norm_relu_backward(gradient, w[norm:norm_bias], trace.normed, trace.scale, features, d_norm, d_norm_bias)
+        normed = matrix(ws.normed[half], 0, n, width)
+        norm_relu_backward(gradient, w[norm:norm_bias], normed, ws.scale[half], features, d_norm, d_norm_bias)
     else:
         relu_backward(gradient, features)
     sum_rows(gradient, g[bias : bias + width])
-    transposed_product(gradient, flat, matrix(g, at, width, flat.shape[1]))
-    product(gradient, matrix(w, at, width, flat.shape[1]), matrix(back.outputs, at_out - last, batch, flat.shape[1]))
-    for layer in range(n_layers - 1, -1, -1):
-        channels, k, positions, channels_below = _convolution(shapes, layer)
-        rows, n_taps = batch * positions, k // channels_below
+    at_out -= n * size
+    transposed_product(gradient, matrix(ws.outputs[half], at_out, n, size), matrix(g, at, width, size))
+    product(gradient, matrix(w, at, width, size), matrix(ws.outputs_back[half], at_out, n, size))
+    for layer in range(len(shapes.convolutions) - 1, -1, -1):
+        channels, channels_below, positions, size_below = shapes.convolutions[layer]
+        k, rows = area * channels_below, n * positions
         at -= channels * (k + 1)
-        at_out -= rows * channels
-        up = matrix(back.outputs, at_out, rows, channels)
-        relu_backward(up, matrix(trace.outputs, at_out, rows, channels))
+        up = matrix(ws.outputs_back[half], at_out, rows, channels)
+        relu_backward(up, matrix(ws.outputs[half], at_out, rows, channels))
         sum_rows(up, g[at + channels * k : at + channels * (k + 1)])
-        if layer == 0:
-            transposed_product(up, patches, matrix(g, at, channels, k))
-        else:
+        inputs = patches
+        if layer:
             at_in -= rows * k
-            d_kernel = back.kernels[at : at + channels * k]
-            transposed_product(up, matrix(trace.inputs, at_in, rows, k), d_kernel.reshape(channels, k))
-            swap_inner(d_kernel, g[at : at + channels * k], channels, n_taps, channels_below)
-            d_inputs = back.inputs[at_in : at_in + rows * k]
-            product(up, matrix(trace.kernels, at, channels, k), d_inputs.reshape(rows, k))
-            size = batch * shapes.convolutions[layer - 1, 2] * channels_below
-            below = back.outputs[at_out - size : at_out]
-            scatter_rows(d_inputs, below, shapes.taps[layer, : positions * n_taps], batch, channels_below)
+            at_out -= n * size_below
+            inputs = ws.inputs[half, at_in : at_in + rows * k]
+            d_inputs = matrix(ws.inputs_back[half], 0, rows, k)
+            product(up, matrix(ws.kernels[half], at, channels, k), d_inputs)
+            starts = shapes.starts[layer, : positions * shapes.kernel_size]
+            images = matrix(ws.outputs_back[half], at_out, n, size_below)
+            scatter_patches(d_inputs.reshape(n, positions * k), images, starts, shapes.kernel_size * channels_below)
+        d_kernel = ws.kernels[half, at : at + channels * k]
+        transposed_product(up, inputs.reshape(rows, k), d_kernel.reshape(channels, k))
+        swap_inner(d_kernel, g[at : at + channels * k], channels, area, channels_below)
 
 
-@njit(error_model="numpy", cache=True)
+@_kernel
 def _head(below: Array, w: Array, at: int, widths: Indices, hidden: Array, out: Array) -> None:
     """Linear layers with ReLU between them, whose parameters start at ``at``."""
-    batch, o = below.shape[0], 0
+    n, o = len(below), 0
     for k in range(len(widths) - 1):
         n_in, n_out = widths[k], widths[k + 1]
         weight, bias = matrix(w, at, n_out, n_in), w[at + n_in * n_out : at + (n_in + 1) * n_out]
@@ -203,15 +263,15 @@ def _head(below: Array, w: Array, at: int, widths: Indices, hidden: Array, out: 
             product_transposed(below, weight, out)
             add_bias(out, bias)
         else:
-            above = matrix(hidden, o, batch, n_out)
+            above = matrix(hidden, o, n, n_out)
             product_transposed(below, weight, above)
             bias_relu(above, bias)
-            o += batch * n_out
+            o += n * n_out
             below = above
         at += n_out * (n_in + 1)
 
 
-@njit(error_model="numpy", cache=True)
+@_kernel
 def _head_backward(
     up: Array,
     bottom: Array,
@@ -220,56 +280,55 @@ def _head_backward(
     at: int,
     widths: Indices,
     hidden: Array,
-    d_hidden: Array,
-    d_bottom: Array,
+    hidden_back: Array,
+    bottom_back: Array,
     needs_weights: bool,
 ) -> None:
     """Its backward pass, from the gradient ``up`` of its output to that of its input."""
-    batch, o = bottom.shape[0], 0
+    n, o = len(bottom), 0
     for k in range(len(widths) - 1):
         at += widths[k + 1] * (widths[k] + 1)
-        o += batch * widths[k] if k else 0
+        o += n * widths[k] if k else 0
     for k in range(len(widths) - 2, -1, -1):
         n_in, n_out = widths[k], widths[k + 1]
         at -= n_out * (n_in + 1)
-        o -= batch * n_in if k else 0
-        below = matrix(hidden, o, batch, n_in) if k else bottom
+        o -= n * n_in if k else 0
+        below = matrix(hidden, o, n, n_in) if k else bottom
         if needs_weights:
             transposed_product(up, below, matrix(g, at, n_out, n_in))
             sum_rows(up, g[at + n_in * n_out : at + (n_in + 1) * n_out])
-        down = matrix(d_hidden, o, batch, n_in) if k else d_bottom
+        down = matrix(hidden_back, o, n, n_in) if k else bottom_back
         product(up, matrix(w, at, n_out, n_in), down)
         if k:
             relu_backward(down, below)
         up = down
 
 
-@njit(error_model="numpy", cache=True)
-def _join(features: Array, actions: Array, w: Array, at: int, action_out: Array, joined: Array) -> None:
+@_kernel
+def _join(features: Array, actions: Array, w: Array, at: int, action_layer: Array, joined: Array) -> None:
     """A critic's action layer, whose parameters start at ``at``, and its concatenation with the features."""
-    (batch, width), n = features.shape, actions.shape[1]
-    n_out = action_out.shape[1]
-    product_transposed(actions, matrix(w, at, n_out, n), action_out)
-    bias_relu(action_out, w[at + n_out * n : at + n_out * (n + 1)])
-    for i in range(batch):
+    (n, width), n_actions, n_out = features.shape, actions.shape[1], action_layer.shape[1]
+    product_transposed(actions, matrix(w, at, n_out, n_actions), action_layer)
+    bias_relu(action_layer, w[at + n_out * n_actions : at + n_out * (n_actions + 1)])
+    for i in range(n):
         for j in range(width):
             joined[i, j] = features[i, j]
         for j in range(n_out):
-            joined[i, width + j] = action_out[i, j]
+            joined[i, width + j] = action_layer[i, j]
 
 
-@njit(error_model="numpy", cache=True)
-def _split(d_joined: Array, action_out: Array, d_features: Array) -> None:
-    """The backward pass of :func:`_join`: adds to ``d_features``, and replaces ``action_out`` by its gradient."""
-    batch, width = d_features.shape
-    for i in range(batch):
+@_kernel
+def _split(joined_back: Array, action_layer: Array, features_back: Array) -> None:
+    """The backward pass of :func:`_join`: adds to ``features_back``, and replaces ``action_layer`` by its gradient."""
+    n, width = features_back.shape
+    for i in range(n):
         for j in range(width):
-            d_features[i, j] += d_joined[i, j]
-        for j in range(action_out.shape[1]):
-            action_out[i, j] = d_joined[i, width + j] if action_out[i, j] > 0 else ZERO
+            features_back[i, j] += joined_back[i, j]
+        for j in range(action_layer.shape[1]):
+            action_layer[i, j] = joined_back[i, width + j] if action_layer[i, j] > 0 else ZERO
 
 
-@njit(error_model="numpy", cache=True)
+@_kernel
 def _bound(raw: Array, is_inverting: bool, out: Array) -> None:
     """The actor's action bound."""
     for i in range(raw.shape[0]):
@@ -277,174 +336,238 @@ def _bound(raw: Array, is_inverting: bool, out: Array) -> None:
             out[i, j] = min(max(raw[i, j], -ONE), ONE) if is_inverting else np.float32(np.tanh(raw[i, j]))
 
 
-@njit(error_model="numpy", cache=True)
-def _new_trace(shapes: Shapes) -> Trace:
-    n_in, n_out, n_kernels = 0, 0, 0
-    for layer in range(len(shapes.convolutions)):
-        channels, k, positions, _ = _convolution(shapes, layer)
-        n_in += shapes.batch * positions * k if layer else 0
-        n_out += shapes.batch * positions * channels
-        n_kernels += channels * (k + 1)
-    batch, width, f32 = shapes.batch, shapes.features, np.float32
-    return Trace(
-        np.empty(n_in, f32),
-        np.empty(n_out, f32),
-        np.empty(n_kernels, f32),
-        np.empty((batch, width), f32),
-        np.empty((batch, width), f32),
-        np.empty(batch, f32),
-        np.empty((batch, width), f32),
-    )
+@_kernel
+def _read_batch(
+    half: int, start: int, stop: int, u: int, shapes: Shapes, replay: Replay, batches: Batches, ws: Workspace
+) -> None:
+    """Copy the patches and actions of samples ``start`` to ``stop`` of minibatch ``u``."""
+    n_rows, run = len(replay.observations), shapes.kernel_size * shapes.channels
+    starts = shapes.starts[0, : shapes.convolutions[0, 2] * shapes.kernel_size]
+    images = matrix(ws.images[half], 0, stop - start, shapes.channels * shapes.side * shapes.side)
+    shape = (stop - start, len(starts) * run)
+    for patches, ahead in ((ws.patches, 0), (ws.next_patches, 1)):
+        for b in range(start, stop):
+            row, env, last = (batches.rows[u, b] + ahead) % n_rows, batches.envs[u, b], batches.last_index[u, b]
+            observation = batches.last[last] if ahead and last >= 0 else replay.observations[row, env]
+            read_image(images[b - start], observation, shapes.channels, shapes.side, b < batches.n_mirrored)
+        gather_patches(matrix(patches[half], 0, *shape), images, starts, run)
+    n_actions = replay.actions.shape[2]
+    for b in range(start, stop):
+        row, env = batches.rows[u, b], batches.envs[u, b]
+        for k in range(n_actions):
+            sign = -ONE if k == 1 and b < batches.n_mirrored else ONE
+            at = (b - start) * n_actions + k
+            ws.actions[half, at] = sign * replay.actions[row, env, k]
+            if len(replay.expert_actions):
+                ws.expert[half, at] = sign * replay.expert_actions[row, env, k]
 
 
-@njit(error_model="numpy", cache=True)
-def update(
+@_kernel
+def _critic_gradient(
+    half: int,
+    u: int,
     shapes: Shapes,
     actor: Learned,
     critic: Learned,
     replay: Replay,
     batches: Batches,
-    actor_step: int,
-    critic_step: int,
-    policy_delay: int,
-    n_updates_before: int,
-    learning_rates: tuple[float, float],
-    gamma: float,
-    tau: float,
-    bc_coef: float,
-    n_mirrored: int,
+    rule: Rule,
+    ws: Workspace,
+) -> None:
+    """The critics' target of one half of minibatch ``u``, their losses and their gradient."""
+    start, stop = _half(half, shapes.batch)
+    n, n_actions, width = stop - start, replay.actions.shape[2], shapes.features
+    ws.losses[half, 0] = 0.0
+    if n == 0:  # a minibatch of one
+        critic.gradients[half, :] = 0
+        return
+    _read_batch(half, start, stop, u, shapes, replay, batches, ws)
+    n_head = (shapes.at_actions - shapes.at_head) // shapes.n_critics
+    n_action_layer = shapes.action_layer * (n_actions + 1)
+    features, features_back = matrix(ws.features[half], 0, n, width), matrix(ws.features_back[half], 0, n, width)
+    hidden, hidden_back = ws.hidden[half], ws.hidden_back[half]
+    joined = matrix(ws.joined[half], 0, n, width + shapes.action_layer)
+    joined_back = matrix(ws.joined_back[half], 0, n, width + shapes.action_layer)
+    action_layer = matrix(ws.action_layer[half], 0, n, shapes.action_layer)
+    actions, chosen = matrix(ws.actions[half], 0, n, n_actions), matrix(ws.chosen[half], 0, n, n_actions)
+    raw = matrix(ws.raw[half], 0, n, n_actions)
+    value, value_back, target = matrix(ws.value[half], 0, n, 1), matrix(ws.value_back[half], 0, n, 1), ws.target[half]
+
+    patches_size = shapes.convolutions[0, 2] * shapes.kernel_size * shapes.kernel_size * shapes.channels
+    patches, next_patches = ws.patches[half, : n * patches_size], ws.next_patches[half, : n * patches_size]
+    _extract(half, n, next_patches, actor.target, shapes, ws, features)
+    _head(features, actor.target, shapes.at_head, shapes.actor_widths, hidden, raw)
+    _bound(raw, shapes.is_inverting, chosen)
+    if len(batches.noise):
+        for b in range(n):
+            for k in range(n_actions):
+                chosen[b, k] = min(max(chosen[b, k] + batches.noise[u, start + b, k], -ONE), ONE)
+    _extract(half, n, next_patches, critic.target, shapes, ws, features)
+    for c in range(shapes.n_critics):
+        _join(features, chosen, critic.target, shapes.at_actions + c * n_action_layer, action_layer, joined)
+        _head(joined, critic.target, shapes.at_head + c * n_head, shapes.critic_widths, hidden, value)
+        for b in range(n):
+            target[b] = value[b, 0] if c == 0 else min(target[b], value[b, 0])
+    for b in range(n):
+        row, env = batches.rows[u, start + b], batches.envs[u, start + b]
+        has_ended = replay.dones[row, env] * (ONE - replay.timeouts[row, env])
+        target[b] = replay.rewards[row, env] + (ONE - has_ended) * np.float32(rule.gamma) * target[b]
+
+    w, g = critic.parameters, critic.gradients[half]
+    _extract(half, n, patches, w, shapes, ws, features)
+    for i in range(n):
+        for j in range(width):
+            features_back[i, j] = ZERO
+    for c in range(shapes.n_critics):
+        at, at_head = shapes.at_actions + c * n_action_layer, shapes.at_head + c * n_head
+        _join(features, actions, w, at, action_layer, joined)
+        _head(joined, w, at_head, shapes.critic_widths, hidden, value)
+        for b in range(n):
+            difference = value[b, 0] - target[b]
+            ws.losses[half, 0] += difference * difference
+            value_back[b, 0] = np.float32(2) * difference / np.float32(shapes.batch)
+        _head_backward(value_back, joined, w, g, at_head, shapes.critic_widths, hidden, hidden_back, joined_back, True)
+        _split(joined_back, action_layer, features_back)
+        transposed_product(action_layer, actions, matrix(g, at, shapes.action_layer, n_actions))
+        sum_rows(action_layer, g[at + shapes.action_layer * n_actions : at + n_action_layer])
+    _extract_backward(half, n, features_back, patches, w, g, shapes, ws, features)
+
+
+@_kernel
+def _actor_gradient(
+    half: int, shapes: Shapes, actor: Learned, critic: Learned, n_actions: int, rule: Rule, ws: Workspace
+) -> None:
+    """The actor's losses on one half of the minibatch that :func:`_critic_gradient` read, and its gradient."""
+    start, stop = _half(half, shapes.batch)
+    n, width = stop - start, shapes.features
+    ws.losses[half, 1] = ws.losses[half, 2] = 0.0
+    if n == 0:
+        actor.gradients[half, :] = 0
+        return
+    features, features_back = matrix(ws.features[half], 0, n, width), matrix(ws.features_back[half], 0, n, width)
+    hidden, hidden_back = ws.hidden[half], ws.hidden_back[half]
+    joined = matrix(ws.joined[half], 0, n, width + shapes.action_layer)
+    joined_back = matrix(ws.joined_back[half], 0, n, width + shapes.action_layer)
+    action_layer = matrix(ws.action_layer[half], 0, n, shapes.action_layer)
+    chosen, expert = matrix(ws.chosen[half], 0, n, n_actions), matrix(ws.expert[half], 0, n, n_actions)
+    raw, raw_back = matrix(ws.raw[half], 0, n, n_actions), matrix(ws.raw_back[half], 0, n, n_actions)
+    value, value_back = matrix(ws.value[half], 0, n, 1), matrix(ws.value_back[half], 0, n, 1)
+    patches_size = shapes.convolutions[0, 2] * shapes.kernel_size * shapes.kernel_size * shapes.channels
+    patches = ws.patches[half, : n * patches_size]
+
+    # The gradient of the first critic's value in the action; the state path gets none.
+    w = critic.parameters
+    _extract(half, n, patches, w, shapes, ws, features_back)
+    _extract(half, n, patches, actor.parameters, shapes, ws, features)
+    _head(features, actor.parameters, shapes.at_head, shapes.actor_widths, hidden, raw)
+    _bound(raw, shapes.is_inverting, chosen)
+    _join(features_back, chosen, w, shapes.at_actions, action_layer, joined)
+    _head(joined, w, shapes.at_head, shapes.critic_widths, ws.critic_hidden[half], value)
+    for b in range(n):
+        ws.losses[half, 1] -= value[b, 0]
+        value_back[b, 0] = -ONE / np.float32(shapes.batch)
+    no_gradients = actor.gradients[half]  # those of the critic are not computed
+    _head_backward(
+        value_back,
+        joined,
+        w,
+        no_gradients,
+        shapes.at_head,
+        shapes.critic_widths,
+        ws.critic_hidden[half],
+        hidden_back,
+        joined_back,
+        False,
+    )
+    _split(joined_back, action_layer, features_back)
+    product(action_layer, matrix(w, shapes.at_actions, shapes.action_layer, n_actions), raw_back)
+    if rule.bc_coef > 0:
+        slope = np.float32(rule.bc_coef / (n_actions * shapes.batch))
+        for b in range(n):
+            for k in range(n_actions):
+                difference = chosen[b, k] - expert[b, k]
+                ws.losses[half, 2] += abs(difference)
+                raw_back[b, k] += slope * np.sign(difference)
+    if shapes.is_inverting:
+        inverting_bound_backward(raw_back, raw, shapes.bound_margin)
+    else:
+        tanh_backward(raw_back, chosen)
+    w, g = actor.parameters, actor.gradients[half]
+    _head_backward(raw_back, features, w, g, shapes.at_head, shapes.actor_widths, hidden, hidden_back, features_back, True)
+    _extract_backward(half, n, features_back, patches, w, g, shapes, ws, features)
+
+
+@_kernel
+def _step(half: int, network: Learned, learning_rate: float, step: int) -> None:
+    """One step of a network's optimizer, in one half of its parameters."""
+    start, stop = _half(half, len(network.parameters))
+    adam(
+        network.parameters[start:stop],
+        network.mean[start:stop],
+        network.square[start:stop],
+        network.gradients[0, start:stop],
+        network.gradients[1, start:stop],
+        learning_rate,
+        step,
+    )
+
+
+@_kernel
+def _wait(barrier: NDArray[np.int64], thread: int, n_threads: int) -> None:
+    """Wait until the other thread is here, too, if there is one."""
+    if n_threads > 1:
+        wait_for_other(barrier, thread)
+
+
+@njit(error_model="numpy", cache=True, nogil=True)
+def update(
+    thread: int,
+    n_threads: int,
+    barrier: NDArray[np.int64],
+    shapes: Shapes,
+    actor: Learned,
+    critic: Learned,
+    replay: Replay,
+    batches: Batches,
+    rule: Rule,
+    ws: Workspace,
+    steps: tuple[int, int],
+    updates_actor: NDArray[np.bool_],
     losses: NDArray[np.float64],
 ) -> None:
     """A round of updates, one for each row of ``batches`` (Algorithm 1 of the paper; Fujimoto et al., 2018, for TD3).
 
-    :param actor_step: steps that the actor's optimizer has taken; ``critic_step`` the same for the critic's
-    :param policy_delay: updates of the critics for each one of the actor and of the targets
-    :param n_updates_before: updates so far, which decide when the actor's turn is
-    :param losses: ``(updates, 3)``: critic loss, actor loss and behavior cloning loss; NaN where the actor was not updated
+    Each of one or two threads calls this with the same arguments and its own number.
+
+    :param thread: 0, or 1 in the second of two threads
+    :param barrier: from :func:`~sb3_flock.rl.barrier_kernels.new_barrier`
+    :param steps: steps that the actor's and the critics' optimizer have taken
+    :param updates_actor: for each update whether it is one of the actor and of the targets, too
+    :param losses: ``(updates, 3)``, filled: critic loss, actor loss and behavior cloning loss
     """
-    f32 = np.float32
-    batch, width, n_actions = shapes.batch, shapes.features, replay.actions.shape[2]
-    widths, n_extractor = shapes.critic_widths, 0
-    for layer in range(len(shapes.convolutions)):
-        n_extractor += shapes.convolutions[layer, 0] * (shapes.convolutions[layer, 1] + 1)
-    n_extractor += width * (shapes.convolutions[-1, 2] * shapes.convolutions[-1, 0] + 1)
-    n_extractor += 2 * width if shapes.has_norm else 0
-    n_head = 0
-    for k in range(len(widths) - 1):
-        n_head += widths[k + 1] * (widths[k] + 1)
-    at_actions, n_action_layer = n_extractor + shapes.n_critics * n_head, shapes.action_layer * (n_actions + 1)
-
-    trace, back = _new_trace(shapes), _new_trace(shapes)
-    features, d_features = trace.features, back.features
-    patches_shape = (batch * shapes.convolutions[0, 2], shapes.convolutions[0, 1])
-    patches, next_patches = np.empty(patches_shape, f32), np.empty(patches_shape, f32)
-    n_hidden = batch * max(shapes.actor_widths.sum(), widths.sum())
-    hidden, d_hidden, spare = np.empty(n_hidden, f32), np.empty(n_hidden, f32), np.empty(n_hidden, f32)
-    joined, d_joined = (
-        np.empty((batch, width + shapes.action_layer), f32),
-        np.empty((batch, width + shapes.action_layer), f32),
-    )
-    action_out = np.empty((batch, shapes.action_layer), f32)
-    actions, chosen, expert = (
-        np.empty((batch, n_actions), f32),
-        np.empty((batch, n_actions), f32),
-        np.empty((batch, n_actions), f32),
-    )
-    raw, d_raw = np.empty((batch, n_actions), f32), np.empty((batch, n_actions), f32)
-    q, d_q, target = np.empty((batch, 1), f32), np.empty((batch, 1), f32), np.empty(batch, f32)
-    in_rows = np.full(batch, -1, np.int64)
-
+    batch, n_actions = shapes.batch, replay.actions.shape[2]
+    actor_step, critic_step = steps
     for u in range(len(batches.rows)):
-        rows, envs = batches.rows[u], batches.envs[u]
-        taps, mirrored = shapes.first_taps, shapes.mirrored_taps
-        gather_patches(patches, replay.observations, rows, envs, batches.last, in_rows, taps, mirrored, n_mirrored)
-        last_index = batches.last_index[u]
-        gather_patches(
-            next_patches, replay.observations, rows + 1, envs, batches.last, last_index, taps, mirrored, n_mirrored
-        )
-        for b in range(batch):
-            for k in range(n_actions):
-                sign = -ONE if k == 1 and b < n_mirrored else ONE
-                actions[b, k] = sign * replay.actions[rows[b], envs[b], k]
-                if bc_coef > 0:
-                    expert[b, k] = sign * replay.expert_actions[rows[b], envs[b], k]
-
-        # The critics' target.
-        _extract(next_patches, actor.target, shapes, trace, features)
-        _head(features, actor.target, n_extractor, shapes.actor_widths, hidden, raw)
-        _bound(raw, shapes.is_inverting, chosen)
-        if len(batches.noise):
-            for b in range(batch):
-                for k in range(n_actions):
-                    chosen[b, k] = min(max(chosen[b, k] + batches.noise[u, b, k], -ONE), ONE)
-        _extract(next_patches, critic.target, shapes, trace, features)
-        for c in range(shapes.n_critics):
-            _join(features, chosen, critic.target, at_actions + c * n_action_layer, action_out, joined)
-            _head(joined, critic.target, n_extractor + c * n_head, widths, hidden, q)
-            for b in range(batch):
-                target[b] = q[b, 0] if c == 0 else min(target[b], q[b, 0])
-        for b in range(batch):
-            future = (ONE - replay.ends[rows[b], envs[b]]) * f32(gamma) * target[b]
-            target[b] = replay.rewards[rows[b], envs[b]] + future
-
-        # The critics.
-        _extract(patches, critic.parameters, shapes, trace, features)
-        d_features[:] = 0
-        loss = 0.0
-        for c in range(shapes.n_critics):
-            at = at_actions + c * n_action_layer
-            _join(features, actions, critic.parameters, at, action_out, joined)
-            at_head = n_extractor + c * n_head
-            _head(joined, critic.parameters, at_head, widths, hidden, q)
-            for b in range(batch):
-                difference = q[b, 0] - target[b]
-                loss += difference * difference
-                d_q[b, 0] = f32(2) * difference / f32(batch)
-            w, g = critic.parameters, critic.gradient
-            _head_backward(d_q, joined, w, g, at_head, widths, hidden, d_hidden, d_joined, True)
-            _split(d_joined, action_out, d_features)
-            transposed_product(action_out, actions, matrix(g, at, shapes.action_layer, n_actions))
-            sum_rows(action_out, g[at + shapes.action_layer * n_actions : at + n_action_layer])
-        losses[u, 0] = loss / batch
-        _extract_backward(d_features, patches, critic.parameters, critic.gradient, shapes, trace, features, back)
-        adam(critic.parameters, critic.mean, critic.square, critic.gradient, learning_rates[1], critic_step + u + 1)
-
-        if (n_updates_before + u + 1) % policy_delay:
-            losses[u, 1] = losses[u, 2] = np.nan
+        for half in range(thread, HALVES, n_threads):
+            _critic_gradient(half, u, shapes, actor, critic, replay, batches, rule, ws)
+        _wait(barrier, thread, n_threads)
+        critic_step += 1
+        losses[u, 0] = (ws.losses[0, 0] + ws.losses[1, 0]) / batch
+        for half in range(thread, HALVES, n_threads):
+            _step(half, critic, rule.critic_learning_rate, critic_step)
+        _wait(barrier, thread, n_threads)
+        if not updates_actor[u]:
             continue
-
-        # The actor, by the first critic's gradient in the action.
+        for half in range(thread, HALVES, n_threads):
+            _actor_gradient(half, shapes, actor, critic, n_actions, rule, ws)
+        _wait(barrier, thread, n_threads)
         actor_step += 1
-        _extract(patches, critic.parameters, shapes, trace, d_features)
-        _extract(patches, actor.parameters, shapes, trace, features)
-        _head(features, actor.parameters, n_extractor, shapes.actor_widths, d_hidden, raw)
-        _bound(raw, shapes.is_inverting, chosen)
-        _join(d_features, chosen, critic.parameters, at_actions, action_out, joined)
-        _head(joined, critic.parameters, n_extractor, widths, hidden, q)
-        loss = 0.0
-        for b in range(batch):
-            loss -= q[b, 0]
-            d_q[b, 0] = -ONE / f32(batch)
-        w = critic.parameters
-        _head_backward(d_q, joined, w, critic.gradient, n_extractor, widths, hidden, spare, d_joined, False)
-        _split(d_joined, action_out, d_features)
-        product(action_out, matrix(w, at_actions, shapes.action_layer, n_actions), d_raw)
-        bc_loss = 0.0
-        if bc_coef > 0:
-            for b in range(batch):
-                for k in range(n_actions):
-                    difference = chosen[b, k] - expert[b, k]
-                    bc_loss += abs(difference)
-                    d_raw[b, k] += f32(bc_coef / (n_actions * batch)) * np.sign(difference)
-            bc_loss /= n_actions * batch
-        losses[u, 1], losses[u, 2] = loss / batch + bc_coef * bc_loss, bc_loss
-        if shapes.is_inverting:
-            inverting_bound_backward(d_raw, raw, shapes.bound_margin)
-        else:
-            tanh_backward(d_raw, chosen)
-        w, g = actor.parameters, actor.gradient
-        _head_backward(d_raw, features, w, g, n_extractor, shapes.actor_widths, d_hidden, hidden, d_features, True)
-        _extract_backward(d_features, patches, w, g, shapes, trace, features, back)
-        adam(w, actor.mean, actor.square, g, learning_rates[0], actor_step)
-        polyak(actor.target, actor.parameters, tau)
-        polyak(critic.target, critic.parameters, tau)
+        bc_loss = (ws.losses[0, 2] + ws.losses[1, 2]) / (n_actions * batch)
+        losses[u, 1], losses[u, 2] = (ws.losses[0, 1] + ws.losses[1, 1]) / batch + rule.bc_coef * bc_loss, bc_loss
+        for half in range(thread, HALVES, n_threads):
+            _step(half, actor, rule.actor_learning_rate, actor_step)
+        for network in (actor, critic):
+            for half in range(thread, HALVES, n_threads):
+                start, stop = _half(half, len(network.parameters))
+                polyak(network.target[start:stop], network.parameters[start:stop], rule.tau)
+        _wait(barrier, thread, n_threads)

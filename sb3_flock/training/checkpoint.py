@@ -13,6 +13,7 @@ import json
 import math
 import platform
 import random
+import re
 import zipfile
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
@@ -32,6 +33,7 @@ from sb3_flock._compat import begin_at, counters, last_observations, set_counter
 from sb3_flock.config.training import TrainingConfig
 from sb3_flock.envs.vec_env import ParameterSharingVecEnv
 from sb3_flock.rl.buffers import load_replay_state, replay_state
+from sb3_flock.rl.compiled_update import compiled_kernels
 from sb3_flock.serialization.load import PolicyError, checkpoint_paths, first_line, read_member, read_tensors
 from sb3_flock.serialization.migrate import MEMBER, check_format, migrate_state
 from sb3_flock.serialization.save import save_model, versions
@@ -187,9 +189,22 @@ def runtime_info(config: TrainingConfig) -> dict[str, str]:
         **versions(),
         "numba": version("numba") if compiled() else "none",
         "machine": f"{platform.system()} {platform.machine()} {th.backends.cpu.get_cpu_capability()}",
+        "processor": _processor(),
+        "update": f"compiled, SciPy {version('scipy')}" if compiled_kernels() else "torch",
         "device": get_device(config.device).type,
         "threads": str(th.get_num_threads()),
     }
+
+
+def _processor() -> str:
+    """Vendor, family and model of the processor: libraries of linear algebra choose their code, and so their rounding, by it."""
+    try:
+        fields = dict(
+            re.findall(r"^(vendor_id|cpu family|model)\s*: (.+)$", Path("/proc/cpuinfo").read_text("utf-8"), re.MULTILINE)
+        )
+    except OSError:
+        fields = {}
+    return " ".join(fields.values()) or platform.processor()
 
 
 class RandomStreams:

@@ -28,6 +28,7 @@ from sb3_flock.rl.callbacks import (
     StopOnNonFiniteLoss,
     StoreExecutedActions,
 )
+from sb3_flock.rl.compiled_update import cores
 from sb3_flock.rl.registry import build_model
 from sb3_flock.serialization.load import PolicyError, check_device, checkpoint_paths, load_policy
 from sb3_flock.serialization.save import save_model
@@ -167,7 +168,7 @@ RESUMABLE = (
 
 def _prepare(config: TrainingConfig) -> tuple[OffPolicyAlgorithm, VecEnv]:
     """The untrained model and its env; every error in a config is raised here, before there is a run folder."""
-    th.set_num_threads(config.torch_threads or (1 if config.algorithm.batch_size < _WIDE_BATCH else _cores()))
+    th.set_num_threads(config.torch_threads or (1 if config.algorithm.batch_size < _WIDE_BATCH else cores()))
     check_device(config.device)
     for scenario in (config.scenario, *config.training_scenarios()):  # raises if the arena is too crowded
         World(scenario).reset([episode_rng(config.seed, 0)])
@@ -303,10 +304,5 @@ def _summary(config: TrainingConfig, model: OffPolicyAlgorithm, folder: Path) ->
         f"{config.algo} for {config.scenario.bodies}; training env: {config.n_flocks} flocks of "
         f"{' and of '.join(str(scenario.n_vehicles) for scenario in scenarios)} vehicles, {scenarios[0].n_obstacles} obstacles "
         f"each; device {model.device}, "
-        f"torch threads {th.get_num_threads()} on {_cores()} cores; {folder}"
+        f"torch threads {th.get_num_threads()} on {cores()} cores; {folder}"
     )
-
-
-def _cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

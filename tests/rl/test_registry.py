@@ -3,13 +3,14 @@ import re
 import numpy as np
 import pytest
 import torch as th
-from stable_baselines3 import DDPG, SAC, TD3
+from stable_baselines3 import DDPG, SAC
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.sac.policies import SACPolicy
 
 from sb3_flock import CompactReplayBuffer, FlockCNN, FlockDDPG, FlockPolicy, load_policy, make_vec_env, save_model
 from sb3_flock.config.training import TrainingConfig
 from sb3_flock.envs.flocking_v0 import observation_space
+from sb3_flock.rl.ddpg import FlockTD3
 from sb3_flock.rl.policies import InvertingBound
 from sb3_flock.rl.registry import (
     ALGORITHMS,
@@ -42,7 +43,7 @@ def build(n_flocks=2, **overrides):
     [
         ("ddpg", FlockDDPG, CompactReplayBuffer, InvertingBound),
         ("ddpg-sb3", DDPG, ReplayBuffer, InvertingBound),
-        ("td3", TD3, CompactReplayBuffer, InvertingBound),
+        ("td3", FlockTD3, CompactReplayBuffer, InvertingBound),
         ("sac", SAC, CompactReplayBuffer, None),
     ],
 )

@@ -10,11 +10,11 @@ import torch as th
 
 from sb3_flock import evaluate, load_policy, train
 from sb3_flock.config.training import TrainingConfig
+from sb3_flock.rl.compiled_update import cores
 from sb3_flock.rl.registry import ALGORITHMS
 from sb3_flock.serialization.load import PolicyError
 from sb3_flock.serialization.yaml_io import load_config
 from sb3_flock.settings import UserError
-from sb3_flock.training.train import _cores
 from tests.helpers import quiet, tiny
 
 
@@ -81,7 +81,7 @@ def test_the_best_model_is_the_one_with_the_lowest_score(tmp_path):
     assert best.num_timesteps == evaluations["timesteps"][evaluations["score"].argmin()]
 
 
-@pytest.mark.parametrize(("threads", "batch_size", "expected"), [(0, 128, 1), (0, 1024, _cores()), (2, 128, 2)])
+@pytest.mark.parametrize(("threads", "batch_size", "expected"), [(0, 128, 1), (0, 1024, cores()), (2, 128, 2)])
 def test_torch_threads_follow_the_batch_and_the_cores_unless_given(tmp_path, threads, batch_size, expected):
     train(tiny(tmp_path, torch_threads=threads, batch_size=batch_size, eval_freq=0, save_freq=0), quiet())
     assert th.get_num_threads() == expected
