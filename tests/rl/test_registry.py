@@ -3,7 +3,7 @@ import re
 import numpy as np
 import pytest
 import torch as th
-from stable_baselines3 import DDPG, SAC
+from stable_baselines3 import DDPG, SAC, TD3
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.sac.policies import SACPolicy
 
