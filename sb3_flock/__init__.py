@@ -7,7 +7,6 @@ the environment with PettingZoo as ``flock/flocking-v0``.
 from __future__ import annotations
 
 import importlib
-from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 import pettingzoo
@@ -101,7 +100,7 @@ _HOMES = {
 
 def __getattr__(name: str) -> Any:
     if name == "__version__":
-        return version("sb3_flock")
+        return importlib.import_module("importlib.metadata").version("sb3_flock")
     if name == "flocking_v0":
         return importlib.import_module("sb3_flock.envs.flocking_v0")
     if name in _HOMES:

@@ -5,21 +5,16 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from sb3_flock.cli import shared
 from sb3_flock.cli.messages import written_to
-from sb3_flock.cli.parsing import add_command, count
+from sb3_flock.cli.parsing import Parser, count
 
 
-def add(commands: Any) -> None:
-    """Add the command."""
-    parser = add_command(
-        commands,
-        "render",
-        run,
+def add(parser: Parser) -> None:
+    """Add the arguments."""
+    parser.describe(
         "ddpg-5v2o -o episode.html --episode 3",
-        help="simulate one episode and write a figure, a video or a web page",
         description="Simulate one episode and write it: .gif, .mp4 and .html are videos, .png and .svg show the paths.",
         renamed={**shared.ROLLOUT_RENAMED, "--out": "--output"},
     )

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from sb3_flock.cli.messages import errors_of
 from sb3_flock.cli.parsing import Parser, count, listed, whole_number
-from sb3_flock.settings import SettingsError
+from sb3_flock.errors import SettingsError
 
 if TYPE_CHECKING:
     import argparse
