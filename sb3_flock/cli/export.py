@@ -27,15 +27,12 @@ def add(parser: Parser) -> None:
 
 def run(options: argparse.Namespace, words: Sequence[str]) -> int:
     """Export, and print how well the graph agrees with the policy."""
-    import torch as th
-
     from sb3_flock.deploy.onnx_export import export
 
     if (options.output is None) == (options.file is None):
         raise SettingsError("export: one -o FILE to write is needed")
     output = options.output or options.file
-    th.set_num_threads(1)
-    policy = shared.load_trusted_or_not(options.policy, "cpu", options.trust)
+    policy = shared.load_trusted_or_not(options.policy, trust=options.trust)
     with written_to("--output", output):
         done = export(policy, output)
     print(

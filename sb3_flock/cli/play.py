@@ -22,11 +22,8 @@ def add(parser: Parser) -> None:
 
 def run(options: argparse.Namespace, words: Sequence[str]) -> int:
     """Open the window."""
-    import torch as th
-
     from sb3_flock.viz.play import play
 
-    th.set_num_threads(1)
     controller, _, scenario = shared.rollout_of(options)
     play(controller, scenario, options.seed, options.speed)
     return 0

@@ -26,7 +26,6 @@ def add(parser: Parser) -> None:
 
 def run(options: argparse.Namespace, words: Sequence[str]) -> int:
     """Render, and print the file's path."""
-    import torch as th
     from rich.console import Console
 
     from sb3_flock.viz.video import check_video, render
@@ -34,7 +33,6 @@ def run(options: argparse.Namespace, words: Sequence[str]) -> int:
     with written_to("--output", options.output):
         check_video(Path(options.output), options.speed)
     controller, name, scenario = shared.rollout_of(options)
-    th.set_num_threads(1)
     title = f"{options.policy or name}: {scenario.bodies}, episode {options.episode} of seed {options.seed}"
     with Console(stderr=True).status("simulating"), written_to("--output", options.output):
         path = render(controller, scenario, options.output, options.seed, options.episode, options.speed, title)

@@ -116,9 +116,7 @@ def run(options: argparse.Namespace, words: Sequence[str]) -> int:
     """Train or resume, and print the table of the best policy and the run folder."""
     with _resume_as_command() as console:
         result = _train_or_resume(options, words, console)
-    from sb3_flock.serialization.load import load_policy
-
-    policy = load_policy(result.best_model)
+    policy = shared.load_trusted_or_not(result.best_model)
     episodes = result.config.n_test_episodes
     shared.evaluate_and_print(policy, str(policy.path), result.config.scenario, episodes, seed=0, console=console)
     print(result.folder)

@@ -98,9 +98,16 @@ def test_the_package_and_the_main_help_import_no_part_of_it(code):
     assert imported(code, HEAVY | LIGHT | {f"sb3_flock.cli.{name}" for name in COMMANDS}) == []
 
 
-@pytest.mark.parametrize("words", [*([name, "--help"] for name in COMMANDS), ["config"]])
-def test_no_help_needs_torch(words):
+@pytest.mark.parametrize(
+    "words", [*([name, "--help"] for name in COMMANDS), ["config"], ["policies"], ["policies", "general"]]
+)
+def test_help_and_what_only_prints_need_nothing_heavy(words):
     assert imported(f"from sb3_flock.cli import main; main({words})", HEAVY) == []
+
+
+def test_a_baseline_controller_is_evaluated_without_torch():
+    words = ["evaluate", "--controller", "go-to-waypoint", "-n", "1", "--set", "max_cycles=2"]
+    assert imported(f"from sb3_flock.cli import main; main({words})", HEAVY - {"numba", "scipy"}) == []
 
 
 @pytest.mark.parametrize(
