@@ -1,18 +1,15 @@
 """sb3_flock: multi-vehicle flocking by reinforcement learning, as a Stable-Baselines3 plugin.
 
-The public names below are imported when they are first used, so that importing the package is quick. Importing it registers
-the environment with PettingZoo as ``flock/flocking-v0``.
+The public names below are imported when they are first used, so that importing the package is quick. In a process that
+imports it, the environment is registered with PettingZoo as ``flock/flocking-v0``.
 """
 
 from __future__ import annotations
 
 import importlib
-from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
-import pettingzoo
-
-from sb3_flock import _renamed
+from sb3_flock import _registration, _renamed
 
 if TYPE_CHECKING:
     from sb3_flock.config.training import TrainingConfig
@@ -101,7 +98,7 @@ _HOMES = {
 
 def __getattr__(name: str) -> Any:
     if name == "__version__":
-        return version("sb3_flock")
+        return importlib.import_module("importlib.metadata").version("sb3_flock")
     if name == "flocking_v0":
         return importlib.import_module("sb3_flock.envs.flocking_v0")
     if name in _HOMES:
@@ -114,6 +111,4 @@ def __dir__() -> list[str]:
 
 
 _renamed.install()
-if "flock/flocking-v0" not in pettingzoo.parallel_registry:
-    pettingzoo.register("parallel", "flock/flocking-v0", entry_point="sb3_flock.envs.flocking_v0:parallel_env")
-    pettingzoo.register("aec", "flock/flocking-v0", entry_point="sb3_flock.envs.flocking_v0:env")
+_registration.install()

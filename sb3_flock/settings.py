@@ -16,6 +16,24 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
 
 from sb3_flock._renamed import rename_fields, rename_key, warn_renamed
+from sb3_flock.errors import RunError, SettingsError, UserError
+
+__all__ = [
+    "Coordinate",
+    "NotNegative",
+    "Positive",
+    "RunError",
+    "Settings",
+    "SettingsError",
+    "UserError",
+    "check_integer",
+    "field_of",
+    "format_value",
+    "group_of",
+    "leaf_paths",
+    "resolve_path",
+    "suggest",
+]
 
 _Settings = TypeVar("_Settings", bound="Settings")
 
@@ -23,31 +41,6 @@ Positive = Annotated[float, Field(ge=1e-6, le=1e6)]
 """Lengths, speeds, weights: bounded so that no formula of the package overflows."""
 NotNegative = Annotated[float, Field(ge=0, le=1e6)]
 Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
-
-
-class UserError(ValueError):
-    """A mistake that the user can correct; the message is one printable line, whatever a file or a flag put into it."""
-
-    def __init__(self, message: str) -> None:
-        super().__init__("".join(letter if letter.isprintable() else "?" for letter in message[:_MAX_MESSAGE]))
-
-
-_MAX_MESSAGE = 2000
-
-
-class RunError(RuntimeError):
-    """A run failed for a reason outside its parameters: a full disk, a dead worker, a diverged training."""
-
-
-class SettingsError(UserError):
-    """A parameter has a value that is not accepted.
-
-    :param parts: one message for each parameter
-    """
-
-    def __init__(self, *parts: str) -> None:
-        self.parts = parts
-        super().__init__("; ".join(parts))
 
 
 class Settings(BaseModel):

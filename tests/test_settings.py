@@ -4,7 +4,6 @@ import pytest
 from sb3_flock.config.training import TrainingConfig
 from sb3_flock.settings import (
     SettingsError,
-    UserError,
     check_integer,
     field_of,
     format_value,
@@ -95,13 +94,6 @@ def test_integers_of_at_least_the_least_are_accepted(value):
 def test_other_values_are_no_counts(value):
     with pytest.raises(SettingsError, match="^episodes = .*: input should be an integer of at least 1$"):
         check_integer("episodes", value, least=1)
-
-
-def test_an_error_is_one_printable_line_of_bounded_length():
-    message = str(UserError("bad\nname \x1b[31m" + "x" * 10_000))
-    assert message.isprintable()
-    assert message.startswith("bad?name ?[31mx")
-    assert len(message) == 2000
 
 
 def test_a_long_value_is_shortened():

@@ -1,6 +1,7 @@
 """The ``sb3-flock`` command: one module per subcommand.
 
-A subcommand imports what it needs when it runs, so that ``--help`` is quick. Nothing outside this package knows about flags.
+The module of a subcommand is imported when it is called, and imports the rest when it runs, so that ``--help`` is quick.
+Nothing outside this package knows about flags.
 """
 
 from __future__ import annotations
@@ -10,13 +11,27 @@ import os
 import sys
 from collections.abc import Sequence
 
-from sb3_flock.cli import compare, config, evaluate, export, migrate, play, policies, render, reproduce, sweep, train
 from sb3_flock.cli.messages import warnings_as_lines
 from sb3_flock.cli.parsing import FAILED, INTERRUPTED, USAGE_ERROR, Parser, VersionAction
-from sb3_flock.settings import RunError, UserError
+from sb3_flock.errors import RunError, UserError
 
-COMMANDS = (train, evaluate, render, play, export, compare, reproduce, sweep, config, policies, migrate)
-"""The modules of the subcommands, in the order of ``--help``: each has ``add(commands)``."""
+COMMANDS = {
+    "train": "train a policy",
+    "evaluate": "simulate many episodes of a policy and print its metrics",
+    "render": "simulate one episode and write a figure, a video or a web page",
+    "play": "simulate live in a window, with mouse and keys",
+    "export": "write a policy as ONNX, for a vehicle's computer",
+    "compare": "show trainings side by side",
+    "reproduce": "write the paper's tables and figures with ours",
+    "sweep": "train or evaluate at many settings, also on a Ray cluster",
+    "config": "print a training's whole config, every key explained",
+    "policies": "list the shipped policies, or show the model card of one",
+    "migrate": "rewrite files of an earlier release in the present format",
+}
+"""The subcommands in the order of ``--help``, with a line each; a module has the name of its subcommand."""
+
+ALIASES = {"play": ["enjoy"]}
+"""Other names of subcommands, as rl_zoo3 has them."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -68,6 +83,6 @@ def _parser() -> Parser:
     )
     parser.add_argument("--version", action=VersionAction, nargs=0, help="show the version and exit")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for command in COMMANDS:
-        command.add(commands)
+    for name, line in COMMANDS.items():
+        commands.add_parser(name, help=line, aliases=ALIASES.get(name, ()), module=f"{__name__}.{name}")
     return parser

@@ -5,21 +5,16 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from sb3_flock.cli import shared
 from sb3_flock.cli.messages import written_to
-from sb3_flock.cli.parsing import add_command
+from sb3_flock.cli.parsing import Parser
 
 
-def add(commands: Any) -> None:
-    """Add the command."""
-    parser = add_command(
-        commands,
-        "compare",
-        run,
+def add(parser: Parser) -> None:
+    """Add the arguments."""
+    parser.describe(
         "runs/ddpg_5v2o_1 runs/ddpg_5v2o_2 -o curves.png",
-        help="show trainings side by side",
         description="Print the best evaluations of trainings and what differs in their configs; plot their curves.",
         renamed={"--out": "--output"},
     )

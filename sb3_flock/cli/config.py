@@ -5,21 +5,16 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from sb3_flock.cli import shared, train
 from sb3_flock.cli.messages import written_to
-from sb3_flock.cli.parsing import add_command
+from sb3_flock.cli.parsing import Parser
 
 
-def add(commands: Any) -> None:
-    """Add the command."""
-    parser = add_command(
-        commands,
-        "config",
-        run,
+def add(parser: Parser) -> None:
+    """Add the arguments."""
+    parser.describe(
         "--n-vehicles 5 -o mine.yaml",
-        help="print a training's whole config, every key explained",
         description="Print the config that `train` would run with the same flags, as YAML with a comment on every key.",
         renamed=train.RENAMED,
     )

@@ -5,22 +5,17 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from sb3_flock.cli import shared
 from sb3_flock.cli.messages import written_to
-from sb3_flock.cli.parsing import add_command, count
-from sb3_flock.settings import SettingsError
+from sb3_flock.cli.parsing import Parser, count
+from sb3_flock.errors import SettingsError
 
 
-def add(commands: Any) -> None:
-    """Add the command."""
-    parser = add_command(
-        commands,
-        "evaluate",
-        run,
+def add(parser: Parser) -> None:
+    """Add the arguments."""
+    parser.describe(
         "runs/ddpg_5v2o_1 --n-vehicles 8 -o result.json",
-        help="simulate many episodes of a policy and print its metrics",
         description="Simulate many episodes of a saved policy at once and print every metric with its interval.",
         renamed={**shared.ROLLOUT_RENAMED, "--json": "--output"},
     )

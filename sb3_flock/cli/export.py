@@ -5,22 +5,17 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from typing import Any
 
 from sb3_flock.cli import shared
 from sb3_flock.cli.messages import written_to
-from sb3_flock.cli.parsing import add_command
-from sb3_flock.settings import SettingsError
+from sb3_flock.cli.parsing import Parser
+from sb3_flock.errors import SettingsError
 
 
-def add(commands: Any) -> None:
-    """Add the command."""
-    parser = add_command(
-        commands,
-        "export",
-        run,
+def add(parser: Parser) -> None:
+    """Add the arguments."""
+    parser.describe(
         "ddpg-5v2o -o policy.onnx",
-        help="write a policy as ONNX, for a vehicle's computer",
         description="Write a policy as an ONNX graph from measured positions to speed and turn rate, and check it.",
         usage="%(prog)s [-h] -o FILE [--trust] POLICY",
     )
@@ -32,15 +27,12 @@ def add(commands: Any) -> None:
 
 def run(options: argparse.Namespace, words: Sequence[str]) -> int:
     """Export, and print how well the graph agrees with the policy."""
-    import torch as th
-
     from sb3_flock.deploy.onnx_export import export
 
     if (options.output is None) == (options.file is None):
         raise SettingsError("export: one -o FILE to write is needed")
     output = options.output or options.file
-    th.set_num_threads(1)
-    policy = shared.load_trusted_or_not(options.policy, "cpu", options.trust)
+    policy = shared.load_trusted_or_not(options.policy, trust=options.trust)
     with written_to("--output", output):
         done = export(policy, output)
     print(

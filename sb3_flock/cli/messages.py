@@ -9,8 +9,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from sb3_flock._renamed import RenamedWarning
-from sb3_flock.serialization.yaml_io import EarlierFormatWarning
-from sb3_flock.settings import SettingsError, UserError
+from sb3_flock.errors import SettingsError, UserError
 
 
 @contextlib.contextmanager
@@ -19,6 +18,8 @@ def warnings_as_lines() -> Iterator[None]:
     shown = set()
 
     def show(message: Warning | str, *_: Any, **__: Any) -> None:
+        from sb3_flock.serialization.yaml_io import EarlierFormatWarning
+
         text = " ".join(str(message).split())
         if isinstance(message, EarlierFormatWarning):
             text += f"; `sb3-flock migrate {message.path}` rewrites it"

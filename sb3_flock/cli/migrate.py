@@ -5,20 +5,15 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from typing import Any
 
-from sb3_flock.cli.parsing import USAGE_ERROR, add_command
-from sb3_flock.settings import UserError
+from sb3_flock.cli.parsing import USAGE_ERROR, Parser
+from sb3_flock.errors import UserError
 
 
-def add(commands: Any) -> None:
-    """Add the command."""
-    parser = add_command(
-        commands,
-        "migrate",
-        run,
+def add(parser: Parser) -> None:
+    """Add the arguments."""
+    parser.describe(
         "mine.zip mine.yaml",
-        help="rewrite files of an earlier release in the present format",
         description="Rewrite policies (zip), model cards (JSON) and configs (YAML) of an earlier release in the present "
         "format, in place. A policy keeps its weights to the last bit. No code from the files is run.",
     )

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import importlib
 import math
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sb3_flock._renamed import warn_renamed
-from sb3_flock.settings import Settings, UserError, leaf_paths, suggest
+from sb3_flock.errors import UserError
+
+if TYPE_CHECKING:
+    from sb3_flock.settings import Settings
 
 FAILED = 1
 USAGE_ERROR = 2
@@ -20,15 +24,28 @@ INTERRUPTED = 130
 class Parser(argparse.ArgumentParser):
     """argparse with errors in one line and without guesses at abbreviated flags.
 
-    :param renamed: old to new names of flags; an old one works, with a warning
+    :param module: a subcommand's module, imported when its words are parsed: its ``add(parser)`` describes the subcommand and
+        adds the arguments, its ``run(options, words)`` runs it
     """
 
-    def __init__(self, renamed: Mapping[str, str] | None = None, **kwargs: Any) -> None:
+    def __init__(self, module: str | None = None, **kwargs: Any) -> None:
         self.flags: list[str] = []
         self.fields: list[str] = []
         """What ``--set`` takes, for hints."""
-        self._renamed = dict(renamed or {})
+        self._module = module
+        self._renamed: Mapping[str, str] = {}
         super().__init__(allow_abbrev=False, **kwargs)
+
+    def describe(
+        self, example: str, description: str, renamed: Mapping[str, str] | None = None, usage: str | None = None
+    ) -> None:
+        """Describe a subcommand.
+
+        :param example: words behind its name
+        :param renamed: old to new names of flags; an old one works, with a warning
+        """
+        self.description, self.epilog, self.usage = description, f"example: {self.prog} {example}", usage
+        self._renamed = renamed or {}
 
     def add_argument(self, *args: Any, **kwargs: Any) -> argparse.Action:
         """Add an argument, and remember its flags for hints."""
@@ -38,6 +55,8 @@ class Parser(argparse.ArgumentParser):
 
     def add_set(self, example: str, settings: type[Settings], which: str = "them all") -> None:
         """Add ``--set`` for the fields of a settings class."""
+        from sb3_flock.settings import leaf_paths
+
         self.fields += [".".join(path) for path in leaf_paths(settings)]
         self.add_argument(
             "--set",
@@ -49,6 +68,10 @@ class Parser(argparse.ArgumentParser):
 
     def parse_known_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> Any:  # type: ignore[override]
         """Parse, with old flags under their present names."""
+        if self._module is not None:
+            command, self._module = importlib.import_module(self._module), None
+            self.set_defaults(run=command.run, parser=self)
+            command.add(self)
         words = list(sys.argv[1:] if args is None else args)
         return super().parse_known_args([self._present(word) for word in words], namespace)
 
@@ -68,6 +91,8 @@ class Parser(argparse.ArgumentParser):
         close = difflib.get_close_matches(flag.replace("_", "-"), self.flags, n=1, cutoff=0.75)
         if close:
             return f"; did you mean {close[0]}?"
+        from sb3_flock.settings import suggest
+
         hint = suggest(flag.lstrip("-").replace("-", "_"), self.fields)
         return hint.replace("did you mean ", "did you mean --set ").replace("?", "=VALUE?")
 
@@ -85,15 +110,6 @@ class VersionAction(argparse.Action):
 
         print(f"sb3-flock {version('sb3_flock')}")
         parser.exit()
-
-
-def add_command(
-    commands: Any, name: str, run: Callable[[argparse.Namespace, Sequence[str]], int], example: str, **kwargs: Any
-) -> Parser:
-    """Add a subcommand that calls ``run(options, words)``."""
-    parser: Parser = commands.add_parser(name, epilog=f"example: sb3-flock {name} {example}", **kwargs)
-    parser.set_defaults(run=run, parser=parser)
-    return parser
 
 
 def whole_number(text: str) -> int | str:

@@ -4,21 +4,15 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from typing import Any
 
 from sb3_flock.cli import shared
-from sb3_flock.cli.parsing import add_command
+from sb3_flock.cli.parsing import Parser
 
 
-def add(commands: Any) -> None:
-    """Add the command."""
-    parser = add_command(
-        commands,
-        "play",
-        run,
+def add(parser: Parser) -> None:
+    """Add the arguments."""
+    parser.describe(
         "general --n-vehicles 8",
-        aliases=["enjoy"],
-        help="simulate live in a window, with mouse and keys",
         description="Simulate live in a window: drag the waypoint, drop obstacles, add vehicles, show what one of them senses.",
         renamed=shared.ROLLOUT_RENAMED,
     )
@@ -28,11 +22,8 @@ def add(commands: Any) -> None:
 
 def run(options: argparse.Namespace, words: Sequence[str]) -> int:
     """Open the window."""
-    import torch as th
-
     from sb3_flock.viz.play import play
 
-    th.set_num_threads(1)
     controller, _, scenario = shared.rollout_of(options)
     play(controller, scenario, options.seed, options.speed)
     return 0

@@ -7,8 +7,9 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from sb3_flock._renamed import POLICIES, warn_renamed
-from sb3_flock.cli.parsing import add_command, listed
-from sb3_flock.settings import SettingsError, suggest
+from sb3_flock.cli.parsing import Parser, listed
+from sb3_flock.errors import SettingsError
+from sb3_flock.settings import suggest
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -16,14 +17,10 @@ if TYPE_CHECKING:
     from sb3_flock.config.training import TrainingConfig
 
 
-def add(commands: Any) -> None:
-    """Add the command."""
-    parser = add_command(
-        commands,
-        "policies",
-        run,
+def add(parser: Parser) -> None:
+    """Add the arguments."""
+    parser.describe(
         "ddpg-bc-5v2o",
-        help="list the shipped policies, or show the model card of one",
         description="List the shipped policies with their results on test episodes, or show the model card of one.",
     )
     parser.add_argument("name", nargs="?", metavar="NAME", help="show this policy's model card")

@@ -5,21 +5,16 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from sb3_flock.cli import shared
 from sb3_flock.cli.messages import written_to
-from sb3_flock.cli.parsing import add_command, count
+from sb3_flock.cli.parsing import Parser, count
 
 
-def add(commands: Any) -> None:
-    """Add the command."""
-    parser = add_command(
-        commands,
-        "render",
-        run,
+def add(parser: Parser) -> None:
+    """Add the arguments."""
+    parser.describe(
         "ddpg-5v2o -o episode.html --episode 3",
-        help="simulate one episode and write a figure, a video or a web page",
         description="Simulate one episode and write it: .gif, .mp4 and .html are videos, .png and .svg show the paths.",
         renamed={**shared.ROLLOUT_RENAMED, "--out": "--output"},
     )
@@ -31,7 +26,6 @@ def add(commands: Any) -> None:
 
 def run(options: argparse.Namespace, words: Sequence[str]) -> int:
     """Render, and print the file's path."""
-    import torch as th
     from rich.console import Console
 
     from sb3_flock.viz.video import check_video, render
@@ -39,7 +33,6 @@ def run(options: argparse.Namespace, words: Sequence[str]) -> int:
     with written_to("--output", options.output):
         check_video(Path(options.output), options.speed)
     controller, name, scenario = shared.rollout_of(options)
-    th.set_num_threads(1)
     title = f"{options.policy or name}: {scenario.bodies}, episode {options.episode} of seed {options.seed}"
     with Console(stderr=True).status("simulating"), written_to("--output", options.output):
         path = render(controller, scenario, options.output, options.seed, options.episode, options.speed, title)

@@ -4,21 +4,16 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from typing import Any
 
 from sb3_flock.cli import shared
 from sb3_flock.cli.messages import written_to
-from sb3_flock.cli.parsing import add_command
+from sb3_flock.cli.parsing import Parser
 
 
-def add(commands: Any) -> None:
-    """Add the command."""
-    parser = add_command(
-        commands,
-        "reproduce",
-        run,
+def add(parser: Parser) -> None:
+    """Add the arguments."""
+    parser.describe(
         "--quick -o results",
-        help="write the paper's tables and figures with ours",
         description="Evaluate the shipped policies and the baseline controllers; write the paper's tables and figures "
         "with ours.",
         renamed={"--out": "--output"},

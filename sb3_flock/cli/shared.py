@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 from sb3_flock.cli.messages import errors_of
 from sb3_flock.cli.parsing import Parser, count, listed, whole_number
-from sb3_flock.settings import SettingsError
+from sb3_flock.errors import SettingsError
 
 if TYPE_CHECKING:
     import argparse
+    from pathlib import Path
 
     from rich.console import Console
 
@@ -84,24 +85,25 @@ def overrides_of(assignments: list[str]) -> dict[str, Any]:
     return overrides
 
 
-def load_trusted_or_not(path: str, device: str, trust: bool) -> Any:
-    """A policy, with a warning if code in its file may run."""
+def load_trusted_or_not(path: str | Path, device: str = "cpu", trust: bool = False) -> Any:
+    """A policy, whose small networks run on one thread; with a warning if code in its file may run."""
+    import torch as th
+
     from sb3_flock.serialization.load import load_policy
 
     if trust:
         print("sb3-flock: warning: --trust runs any code that is in the policy file", file=sys.stderr)
+    th.set_num_threads(1)
     return load_policy(path, device, trust)
 
 
 def evaluate_and_print(controller: Any, name: str, scenario: Any, episodes: int, seed: int, console: Console) -> Any:
     """Evaluate, print the table, and return the metrics."""
-    import torch as th
     from rich.console import Console as RichConsole
 
     from sb3_flock.evaluation import evaluate
     from sb3_flock.evaluation.report import metrics_table
 
-    th.set_num_threads(1)
     with console.status(f"simulating {episodes} episodes"):
         metrics = evaluate(controller, scenario, episodes, seed)
     print(f"{name}:")

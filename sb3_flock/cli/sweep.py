@@ -10,20 +10,16 @@ from typing import Any
 
 from sb3_flock.cli import shared
 from sb3_flock.cli.messages import errors_of
-from sb3_flock.cli.parsing import FAILED, INTERRUPTED, add_command, count
-from sb3_flock.settings import SettingsError
+from sb3_flock.cli.parsing import FAILED, INTERRUPTED, Parser, count
+from sb3_flock.errors import SettingsError
 
 
-def add(commands: Any) -> None:
-    """Add the command."""
+def add(parser: Parser) -> None:
+    """Add the arguments."""
     from sb3_flock.config.training import TrainingConfig
 
-    parser = add_command(
-        commands,
-        "sweep",
-        run,
+    parser.describe(
         "configs/sweep_lambda.yaml --set total_timesteps=20000",
-        help="train or evaluate at many settings, also on a Ray cluster",
         description="Train at every point of a grid or a search, as many at once as there are cores; rank the settings.",
         renamed={"--out": "--output"},
     )

@@ -9,8 +9,9 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from sb3_flock.cli import shared
-from sb3_flock.cli.parsing import Parser, add_command, listed, whole_number
-from sb3_flock.settings import RunError, SettingsError, field_of
+from sb3_flock.cli.parsing import Parser, listed, whole_number
+from sb3_flock.errors import RunError, SettingsError
+from sb3_flock.settings import field_of
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -36,14 +37,10 @@ CONFIG_FLAGS: dict[str, tuple[tuple[str, ...], str]] = {
 RENAMED = {"--scenario": "--obstacle-motion"}
 
 
-def add(commands: Any) -> None:
-    """Add the command."""
-    parser = add_command(
-        commands,
-        "train",
-        run,
+def add(parser: Parser) -> None:
+    """Add the arguments."""
+    parser.describe(
         "--n-vehicles 5 --set reward.lambda_=0.5",
-        help="train a policy",
         description="Train one shared policy and leave a run folder.",
         renamed=RENAMED,
     )
@@ -119,9 +116,7 @@ def run(options: argparse.Namespace, words: Sequence[str]) -> int:
     """Train or resume, and print the table of the best policy and the run folder."""
     with _resume_as_command() as console:
         result = _train_or_resume(options, words, console)
-    from sb3_flock.serialization.load import load_policy
-
-    policy = load_policy(result.best_model)
+    policy = shared.load_trusted_or_not(result.best_model)
     episodes = result.config.n_test_episodes
     shared.evaluate_and_print(policy, str(policy.path), result.config.scenario, episodes, seed=0, console=console)
     print(result.folder)

@@ -1,4 +1,7 @@
-"""Model cards: how a shipped policy was trained and how it performs, as JSON beside its zip."""
+"""Model cards: how a shipped policy was trained and how it performs, as JSON beside its zip.
+
+Cards are read without torch; what writes them imports it.
+"""
 
 from __future__ import annotations
 
@@ -10,13 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch as th
 from numpy.typing import NDArray
 
 from sb3_flock.config.training import TrainingConfig
 from sb3_flock.evaluation.rollout import evaluate
 from sb3_flock.pretrained import shipped_policies
-from sb3_flock.serialization.load import load_policy
 from sb3_flock.serialization.migrate import MEMBER
 
 CHECK_EPISODES, CHECK_SEED = 50, 7
@@ -46,6 +47,8 @@ def ship(name: str, runs: Sequence[str | Path], folder: str | Path, episodes: in
     :param episodes: number of episodes of each result
     :return: the path of the zip
     """
+    from sb3_flock.serialization.load import load_policy
+
     folder, records, best = Path(folder), [], (np.inf, Path())
     for run in map(Path, runs):
         history = np.load(run / "evaluations.npz")
@@ -71,6 +74,8 @@ def ship(name: str, runs: Sequence[str | Path], folder: str | Path, episodes: in
 
 def _record(run: Path, history: Mapping[str, NDArray[np.float64]], episodes: int) -> dict[str, Any]:
     """The record of one training: its command, its length, its learning curve and its results."""
+    from sb3_flock.serialization.load import load_policy
+
     policy = load_policy(run)
     metrics = evaluate(policy, episodes=episodes, seed=0)
     return {
@@ -88,6 +93,8 @@ def _copy_light(source: Path, target: Path) -> None:
 
     The config's ``output_dir`` is reset, because it names a folder of the training machine.
     """
+    import torch as th
+
     with zipfile.ZipFile(source) as archive, zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as copy:
         for name in archive.namelist():
             content = archive.read(name)

@@ -12,7 +12,6 @@ from sb3_flock._renamed import warn_renamed
 from sb3_flock.controllers import Controller
 from sb3_flock.controllers.policy import PolicyController
 from sb3_flock.evaluation.metrics import EpisodeMetrics, Metric, summarize
-from sb3_flock.serialization.load import LoadedPolicy
 from sb3_flock.settings import SettingsError, check_integer
 from sb3_flock.sim import Scenario, Sensing, World, episode_rng, own_reward, reward_terms
 
@@ -88,6 +87,8 @@ def as_controller(policy: Any, scenario: Scenario) -> Controller:
     """
     if isinstance(policy, Controller):
         return policy
+    from sb3_flock.serialization.load import LoadedPolicy  # imports torch, which no other controller needs
+
     if isinstance(policy, LoadedPolicy):
         policy.check(scenario)
     if callable(getattr(policy, "act", None)):  # accepted without the base class by the previous release

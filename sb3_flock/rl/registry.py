@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from stable_baselines3.common.policies import BasePolicy
     from stable_baselines3.common.vec_env import VecEnv
 
-    from sb3_flock.rl.torch_layers import FlockCNN
-
 
 def flock_policy_kwargs(network: NetworkConfig) -> dict[str, Any]:
     """The ``policy_kwargs`` of :class:`FlockPolicy` and :class:`FlockSACPolicy` that build a config's networks."""
@@ -199,12 +197,18 @@ def _action_noise(settings: ModelSettings) -> ActionNoise | None:
     return NormalActionNoise(np.zeros(2), np.full(2, start))
 
 
-def fewest_parameters(settings: ModelSettings, extractor: FlockCNN) -> int:
+def fewest_parameters(settings: ModelSettings, observation_shape: tuple[int, ...]) -> int:
     """A lower bound of the number of parameters of an actor and its critics, without building them.
 
-    :param extractor: one features extractor, which may be on torch's ``meta`` device
+    :param observation_shape: ``(channels, l, l)``
     """
     network = settings.network
+    fan_in, side, _ = observation_shape
+    extractor = 0
+    for channels in network.channels:
+        extractor += (fan_in * network.kernel_size**2 + 1) * channels
+        fan_in, side = channels, max(0, (side - network.kernel_size) // network.stride + 1)
+    extractor += (fan_in * side**2 + 1) * network.features_dim
     widths = [network.features_dim, *network.net_arch, 1]
     head = sum((fan_in + 1) * fan_out for fan_in, fan_out in pairwise(widths))
-    return 2 * sum(parameter.numel() for parameter in extractor.parameters()) + (1 + network.n_critics) * head
+    return 2 * extractor + (1 + network.n_critics) * head

@@ -28,8 +28,7 @@ from sb3_flock.config.training import TrainingConfig
 from sb3_flock.envs.flocking_v0 import action_space, observation_space
 from sb3_flock.pretrained import shipped_policies
 from sb3_flock.rl.ddpg import FlockDDPG
-from sb3_flock.rl.registry import ALGORITHMS, extractor_kwargs, fewest_parameters, policy_kwargs
-from sb3_flock.rl.torch_layers import FlockCNN
+from sb3_flock.rl.registry import ALGORITHMS, fewest_parameters, policy_kwargs
 from sb3_flock.serialization.migrate import FORMAT, MEMBER, check_format, migrate_config, migrate_weights
 from sb3_flock.settings import SettingsError, UserError
 from sb3_flock.sim import Scenario
@@ -230,7 +229,7 @@ def _rebuild(config: TrainingConfig, weights: Mapping[str, Any], actor_only: boo
             raise ValueError("policy.pth holds more than plain tensors")
     storages = [(tensor.untyped_storage(), tensor.element_size()) for tensor in weights.values()]
     stored = sum({storage.data_ptr(): storage.nbytes() // size for storage, size in storages}.values())
-    needed = _fewest_parameters(config)
+    needed = fewest_parameters(config, config.scenario.observation_shape)
     if needed > stored:
         raise ValueError(f"policy.pth holds {stored} numbers, the networks at least {needed}")
     policy = _build_policy(config)
@@ -242,11 +241,11 @@ def _rebuild(config: TrainingConfig, weights: Mapping[str, Any], actor_only: boo
     return policy
 
 
-def _fewest_parameters(config: TrainingConfig) -> int:
-    """A lower bound of the number of parameters of a config's networks, computed without building them."""
-    with th.device("meta"):  # shapes without memory
-        extractor = FlockCNN(observation_space(config.scenario), **extractor_kwargs(config.network))
-    return fewest_parameters(config, extractor)
+class _NoOptimizer:
+    """Stands for the optimizers of a policy that is not trained; torch's own would import its compiler, for a second."""
+
+    def __init__(self, *_: Any, **__: Any) -> None:
+        """Takes what an optimizer takes."""
 
 
 def _build_policy(config: TrainingConfig) -> BasePolicy:
@@ -255,7 +254,7 @@ def _build_policy(config: TrainingConfig) -> BasePolicy:
         observation_space(config.scenario),
         action_space(config.scenario),
         lr_schedule=lambda _: 0.0,
-        **{**policy_kwargs(config), "optimizer_kwargs": {}},
+        **{**policy_kwargs(config), "optimizer_class": _NoOptimizer},
     )
 
 

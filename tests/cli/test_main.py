@@ -7,8 +7,6 @@ import pytest
 from sb3_flock.cli import COMMANDS, main
 from sb3_flock.settings import SettingsError
 
-NAMES = [command.__name__.rsplit(".", maxsplit=1)[-1] for command in COMMANDS]
-
 
 @pytest.mark.parametrize(
     ("words", "expected"),
@@ -42,7 +40,7 @@ def test_a_users_mistake_is_one_line_and_exit_code_2(words, expected, fails, tmp
     fails(words, *expected)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", COMMANDS)
 def test_help_fits_a_screen_and_gives_an_example(name, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     with pytest.raises(SystemExit) as stop:
@@ -61,7 +59,7 @@ def test_the_main_help_lists_every_command(capsys, monkeypatch):
     assert stop.value.code == 0
     shown = capsys.readouterr().out
     assert max(map(len, shown.splitlines())) <= 80
-    assert [name for name in NAMES if f"\n    {name} " not in shown] == []
+    assert [name for name in COMMANDS if f"\n    {name} " not in shown] == []
     assert "example: sb3-flock train" in shown
 
 
@@ -71,21 +69,45 @@ def test_the_command_is_installed():
     assert shown.stdout.startswith("sb3-flock 0.")
 
 
-@pytest.mark.parametrize("words", ["[]", "['--help']", "['train', '--help']", "['config']"])
-def test_the_parser_help_and_config_need_no_torch(words):
+HEAVY = {"torch", "stable_baselines3", "numba", "scipy", "supersuit", "tensorboard", "matplotlib", "pandas"}
+"""What only a command that runs may import."""
+
+LIGHT = {"pettingzoo", "gymnasium", "numpy", "pydantic", "yaml", "rich", "sb3_flock.sim", "sb3_flock.serialization"}
+"""What is not imported before a subcommand is chosen."""
+
+
+def imported(code, modules):
+    """Which of the modules a new process has imported after it ran the code."""
     code = f"""
 import sys
-from sb3_flock.cli import _parser, main
-_parser()
 try:
-    {words} and main({words})
+    {code}
 except SystemExit:
     pass
-heavy = [name for name in ("torch", "stable_baselines3") if name in sys.modules]
-sys.exit(f"imported: {{heavy}}" if heavy else 0)
+sys.stderr.write(" ".join({modules} & set(sys.modules)))
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stderr) == (0, "")
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return done.stderr.split()
+
+
+@pytest.mark.parametrize(
+    "code",
+    ["import sb3_flock", *(f"from sb3_flock.cli import main; main(['{word}'])" for word in ("--help", "--version"))],
+)
+def test_the_package_and_the_main_help_import_no_part_of_it(code):
+    assert imported(code, HEAVY | LIGHT | {f"sb3_flock.cli.{name}" for name in COMMANDS}) == []
+
+
+@pytest.mark.parametrize(
+    "words", [*([name, "--help"] for name in COMMANDS), ["config"], ["policies"], ["policies", "general"]]
+)
+def test_help_and_what_only_prints_need_nothing_heavy(words):
+    assert imported(f"from sb3_flock.cli import main; main({words})", HEAVY) == []
+
+
+def test_a_baseline_controller_is_evaluated_without_torch():
+    words = ["evaluate", "--controller", "go-to-waypoint", "-n", "1", "--set", "max_cycles=2"]
+    assert imported(f"from sb3_flock.cli import main; main({words})", HEAVY - {"numba", "scipy"}) == []
 
 
 @pytest.mark.parametrize(

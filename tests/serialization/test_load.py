@@ -290,3 +290,17 @@ def test_files_of_plain_sb3_with_other_parts_need_trust(tmp_path):
     with pytest.warns(UserWarning, match="the default is assumed"):
         trusted = load_policy(tmp_path / "plain.zip", trust=True)
     np.testing.assert_array_equal(trusted.predict(observations)[0], plain.predict(observations, deterministic=True)[0])
+
+
+def test_loading_and_evaluating_imports_neither_torchs_compiler_nor_what_trains_or_plots():
+    """Importing torch's compiler takes a second; a torch optimizer imports it, and so do operations on the meta device."""
+    code = """
+import sys
+from sb3_flock import evaluate, load_policy
+policy = load_policy("ddpg-3v1o")
+evaluate(policy, policy.scenario.replace(max_cycles=2), episodes=1)
+slow = {"torch._dynamo", "sympy", "matplotlib", "pandas", "supersuit", "onnx", "ray", "sb3_flock.training.train"}
+sys.exit(f"imported: {slow & set(sys.modules)}" if slow & set(sys.modules) else 0)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")

@@ -1,0 +1,28 @@
+"""The errors of the package that are not of one of its parts alone; importable in no time, unlike what raises them."""
+
+from __future__ import annotations
+
+
+class UserError(ValueError):
+    """A mistake that the user can correct; the message is one printable line, whatever a file or a flag put into it."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__("".join(letter if letter.isprintable() else "?" for letter in message[:_MAX_MESSAGE]))
+
+
+_MAX_MESSAGE = 2000
+
+
+class RunError(RuntimeError):
+    """A run failed for a reason outside its parameters: a full disk, a dead worker, a diverged training."""
+
+
+class SettingsError(UserError):
+    """A parameter has a value that is not accepted.
+
+    :param parts: one message for each parameter
+    """
+
+    def __init__(self, *parts: str) -> None:
+        self.parts = parts
+        super().__init__("; ".join(parts))
