@@ -1,7 +1,7 @@
 """sb3_flock: multi-vehicle flocking by reinforcement learning, as a Stable-Baselines3 plugin.
 
-The public names below are imported when they are first used, so that importing the package is quick. In a process that
-imports it, the environment is registered with PettingZoo as ``flock/flocking-v0``.
+The public names below are imported when they are first used, so that importing the package is quick. Importing it registers
+the environment with PettingZoo as ``flock/flocking-v0``.
 """
 
 from __future__ import annotations
@@ -9,7 +9,9 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from sb3_flock import _registration, _renamed
+import pettingzoo
+
+from sb3_flock import _renamed
 
 if TYPE_CHECKING:
     from sb3_flock.config.training import TrainingConfig
@@ -111,4 +113,6 @@ def __dir__() -> list[str]:
 
 
 _renamed.install()
-_registration.install()
+if "flock/flocking-v0" not in pettingzoo.parallel_registry:
+    pettingzoo.register("parallel", "flock/flocking-v0", entry_point="sb3_flock.envs.flocking_v0:parallel_env")
+    pettingzoo.register("aec", "flock/flocking-v0", entry_point="sb3_flock.envs.flocking_v0:env")

@@ -72,7 +72,7 @@ def test_the_command_is_installed():
 HEAVY = {"torch", "stable_baselines3", "numba", "scipy", "supersuit", "tensorboard", "matplotlib", "pandas"}
 """What only a command that runs may import."""
 
-LIGHT = {"pettingzoo", "gymnasium", "numpy", "pydantic", "yaml", "rich", "sb3_flock.sim", "sb3_flock.serialization"}
+LIGHT = {"pydantic", "yaml", "rich", "sb3_flock.sim", "sb3_flock.serialization"}
 """What is not imported before a subcommand is chosen."""
 
 
