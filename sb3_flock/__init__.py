@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from sb3_flock.evaluation import evaluate, register_metric
     from sb3_flock.rl.buffers import CompactReplayBuffer
     from sb3_flock.rl.callbacks import NeighborInclusiveReward
-    from sb3_flock.rl.ddpg import FlockDDPG
+    from sb3_flock.rl.ddpg import FlockDDPG, FlockTD3
     from sb3_flock.rl.policies import FlockPolicy, FlockSACPolicy
     from sb3_flock.rl.registry import register_algorithm
     from sb3_flock.rl.torch_layers import FlockCNN
@@ -43,6 +43,7 @@ __all__ = [
     "FlockEvalCallback",
     "FlockPolicy",
     "FlockSACPolicy",
+    "FlockTD3",
     "NeighborInclusiveReward",
     "RewardWeights",
     "Scenario",
@@ -75,6 +76,7 @@ _HOMES = {
     "FlockEvalCallback": "training.eval_callback",
     "FlockPolicy": "rl.policies",
     "FlockSACPolicy": "rl.policies",
+    "FlockTD3": "rl.ddpg",
     "NeighborInclusiveReward": "rl.callbacks",
     "RewardWeights": "sim",
     "Scenario": "sim",
