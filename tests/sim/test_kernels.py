@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sb3_flock.sim import observation, sensing
+from sb3_flock.sim import Scenario, World, dynamics, episode_rng, mix_rewards, observation, reward, sensing
 
 kernels = pytest.importorskip("sb3_flock.sim.kernels")
 
@@ -23,6 +23,45 @@ def test_contacts_are_those_of_numpy(seed, flocks, vehicles, obstacles, sensing_
     found = kernels.find_contacts(positions, frames, bodies, sensing_range, exclude_self)
     for values, name in zip(found, ("observers", "bodies", "positions", "distances"), strict=True):
         np.testing.assert_array_equal(values, getattr(plain, name), err_msg=name)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**31), st.integers(1, 3), st.integers(1, 6), st.integers(0, 4))
+def test_bodies_move_as_in_numpy(seed, flocks, vehicles, obstacles):
+    rng = np.random.default_rng(seed)
+    positions, controls = rng.uniform(-1, 1, (2, flocks, vehicles, 2))
+    headings, obstacle_headings = (rng.uniform(-np.pi, np.pi, (flocks, count)) for count in (vehicles, obstacles))
+    arguments = (
+        positions,
+        dynamics.directions_of(headings),
+        headings,
+        controls,
+        rng.uniform(-1, 1, (flocks, obstacles, 2)),
+        dynamics.directions_of(obstacle_headings),
+        obstacle_headings,
+        *rng.uniform(-20, 20, (2, flocks, obstacles)),
+        0.1,
+        0.8,  # some obstacles are outside
+    )
+    for fast, plain in zip(kernels.move_bodies(*arguments), dynamics.move_bodies(*arguments), strict=True):
+        np.testing.assert_array_equal(fast, plain)
+
+
+def test_sensing_counting_and_mixing_are_those_of_numpy(monkeypatch):
+    def sensed():
+        world = World(Scenario(n_vehicles=9, n_obstacles=4, arena=0.3), 5)
+        seen = world.reset([episode_rng(0, episode) for episode in range(5)])
+        graph = seen.neighbors
+        mixed = mix_rewards(np.arange(45.0).reshape(5, 9), graph.observers, graph.vehicles, 0.7)
+        counts = graph.count(), graph.count(0.12), seen.obstacles.count(0.2)
+        contacts = [getattr(of, name) for of in (graph, seen.obstacles) for name in ("bodies", "positions", "distances")]
+        return [mixed, *counts, *contacts, seen.waypoint_positions, seen.waypoint_distances]
+
+    fast = sensed()
+    for module in (sensing, reward):
+        monkeypatch.setattr(module, "compiled", lambda: None)
+    for compiled, plain in zip(fast, sensed(), strict=True):
+        np.testing.assert_array_equal(compiled, plain)
 
 
 @settings(max_examples=60, deadline=None)
