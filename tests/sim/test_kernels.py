@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sb3_flock.sim import Scenario, World, dynamics, episode_rng, mix_rewards, observation, reward, sensing
+from sb3_flock.sim import Scenario, World, dynamics, episode_rng, mix_rewards, reward, sensing
 
 kernels = pytest.importorskip("sb3_flock.sim.kernels")
 
@@ -62,29 +62,3 @@ def test_sensing_counting_and_mixing_are_those_of_numpy(monkeypatch):
         monkeypatch.setattr(module, "compiled", lambda: None)
     for compiled, plain in zip(fast, sensed(), strict=True):
         np.testing.assert_array_equal(compiled, plain)
-
-
-@settings(max_examples=60, deadline=None)
-@given(st.integers(0, 2**31), st.integers(1, 600), st.integers(0, 200), st.sampled_from([2, 5, 11]), st.floats(0.2, 3.0))
-def test_rasterized_channels_are_those_of_numpy_whatever_they_held_before(seed, vehicles, n_bodies, side, width):
-    rng = np.random.default_rng(seed)
-    counts = rng.multinomial(n_bodies, [0.6, 0.0, 0.4])
-    observers = np.concatenate([np.sort(rng.integers(0, vehicles, count)) for count in counts])
-    positions = rng.uniform(-0.5, 0.5, (n_bodies, 2))
-    positions[rng.random(n_bodies) < 0.05] *= 1e4  # far outside the channel
-    radii = np.array([0.3, 0.2, 0.5])
-    sigmas = width * 2 * radii / (side - 1)
-    fast, plain = (rng.normal(size=(vehicles, 3, side, side)).astype(np.float32) for _ in range(2))
-    kernels.rasterize(fast, counts, observers, positions, radii, sigmas, (0,) * side)
-    ends = np.cumsum(counts)
-    for channel, (start, end) in enumerate(zip(ends - counts, ends, strict=True)):
-        shown = observers[start:end], positions[start:end]
-        observation.rasterize(plain, channel, *shown, radii[channel], sigmas[channel])
-    np.testing.assert_allclose(fast, plain, rtol=1e-5, atol=1e-20)
-
-
-@pytest.mark.parametrize(
-    ("exponent", "tolerance"), [(0.0, 0.0), (1.0, 3e-13), (-80.0, 3e-13), (100.0, 3e-13), (-300.0, 2e-9), (-500.0, 4e-7)]
-)
-def test_the_vectorized_exponential(exponent, tolerance):
-    assert kernels._exp(exponent) == pytest.approx(np.exp(exponent), rel=tolerance, abs=0.0)
