@@ -62,9 +62,46 @@ def turn(headings: NDArray[np.float64], turn_rates: NDArray[np.float64], dt: flo
     return wrap_angle(headings + turn_rates * dt)
 
 
+def move_bodies(
+    positions: NDArray[np.float64],
+    directions: NDArray[np.float64],
+    headings: NDArray[np.float64],
+    controls: NDArray[np.float64],
+    obstacle_positions: NDArray[np.float64],
+    obstacle_directions: NDArray[np.float64],
+    obstacle_headings: NDArray[np.float64],
+    obstacle_speeds: NDArray[np.float64],
+    obstacle_turn_rates: NDArray[np.float64],
+    dt: float,
+    half_side: float,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """The unicycles' next state: vehicles by their controls, obstacles by drawn ones and turned back at the edge of their square.
+
+    :param positions: of the vehicles, ``(flocks, vehicles, 2)`` [m]
+    :param directions: cosine and sine of their headings, ``(flocks, vehicles, 2)``
+    :param headings: ``(flocks, vehicles)`` [rad]
+    :param controls: v [m/s] and omega [rad/s], ``(flocks, vehicles, 2)``
+    :param obstacle_positions: ``(flocks, obstacles, 2)`` [m], as the further ones
+    :param dt: sampling period [s]
+    :param half_side: of the obstacles' square [m]
+    :return: the next ``positions``, ``headings``, ``obstacle_positions`` and ``obstacle_headings``
+    """
+    moved = move(obstacle_positions, obstacle_directions, obstacle_speeds, dt)
+    outside = np.maximum(np.abs(moved[..., 0]), np.abs(moved[..., 1])) > half_side
+    return (
+        move(positions, directions, controls[..., 0], dt),
+        turn(headings, controls[..., 1], dt),
+        np.clip(moved, -half_side, half_side),
+        wrap_angle(obstacle_headings + obstacle_turn_rates * dt + np.pi * outside),
+    )
+
+
 def directions_of(headings: NDArray[np.float64]) -> NDArray[np.float64]:
     """Cosine and sine of headings ``(...)`` [rad], ``(..., 2)``."""
-    return np.stack((np.cos(headings), np.sin(headings)), axis=-1)
+    directions = np.empty((*headings.shape, 2))
+    np.cos(headings, out=directions[..., 0])
+    np.sin(headings, out=directions[..., 1])
+    return directions
 
 
 def wrap_angle(angles: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 
     from sb3_flock.sim.sensing import Sensing
 
+_MOST_COMPILED = 64
+"""Largest number of anchors per side for which numba is used; its unrolled loops take long to compile for more."""
+
 
 @dataclass(frozen=True)
 class Channel:
@@ -136,28 +139,32 @@ def observe(sensing: Sensing, settings: ObservationSettings, use_numba: bool = T
     """
     shape, n_channels = sensing.waypoint_distances.shape, len(settings.channels)
     channels = np.empty((shape[0] * shape[1], *settings.observation_shape), dtype=np.float32)
-    _fill(channels, 0, sensing, settings, use_numba)
+    sensings = [sensing]
     if settings.motion_lag:
-        previous = sensing if sensing.previous is None else sensing.previous
-        _fill(channels, n_channels, previous, settings, use_numba)
+        sensings.append(sensing if sensing.previous is None else sensing.previous)
+    radii = settings.channel_radii
+    shown = [
+        _bodies(channel, source, radius)
+        for source in sensings
+        for channel, radius in zip(settings.channels, radii, strict=True)
+    ]
+    sigmas = [settings.anchor_width * 2 * radius / (settings.n_anchors - 1) for radius in radii]
+    # From the first anchor to the last, the compiled Gaussians must not underflow on their way.
+    is_compiled = use_numba and settings.n_anchors <= min(_MOST_COMPILED, 1 + 30 * settings.anchor_width)
+    kernels = compiled() if is_compiled else None
+    if kernels is None:
+        for number, (observers, positions) in enumerate(shown):
+            rasterize(channels, number, observers, positions, radii[number % n_channels], sigmas[number % n_channels])
+    else:
+        all_observers, all_positions = (np.concatenate(parts) for parts in zip(*shown, strict=True))
+        counts, repeats = np.array([len(observers) for observers, _ in shown]), len(sensings)
+        kernels.rasterize(
+            channels, counts, all_observers, all_positions, np.array(radii * repeats), np.array(sigmas * repeats),
+            (0,) * settings.n_anchors,
+        )  # fmt: skip
+    if settings.motion_lag:
         np.subtract(channels[:, :n_channels], channels[:, n_channels:], out=channels[:, n_channels:])
     return channels.reshape(*shape, *settings.observation_shape)
-
-
-def _fill(
-    channels: NDArray[np.float32], first: int, sensing: Sensing, settings: ObservationSettings, use_numba: bool
-) -> None:
-    """Fill the channels from number ``first`` on with one sensing."""
-    # From the first anchor to the last, the compiled Gaussians must not underflow on their way.
-    kernels = compiled() if use_numba and settings.n_anchors - 1 <= 30 * settings.anchor_width else None
-    for number, channel in enumerate(settings.channels, first):
-        radius = channel.radius(settings)
-        observers, positions = _bodies(channel, sensing, radius)
-        sigma = settings.anchor_width * 2 * radius / (settings.n_anchors - 1)
-        if kernels is None:
-            rasterize(channels, number, observers, positions, radius, sigma)
-        else:
-            kernels.rasterize(channels, number, observers, positions, radius, sigma, (0,) * settings.n_anchors)
 
 
 def _bodies(channel: Channel, sensing: Sensing, radius: float) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

@@ -14,6 +14,7 @@ import numpy as np
 from pydantic import Field, field_validator
 
 from sb3_flock.settings import NotNegative, Positive, Settings, suggest
+from sb3_flock.sim.backend import compiled
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -129,6 +130,9 @@ def mix_rewards(
     :return: the shape of ``rewards``
     """
     own = np.asarray(rewards, dtype=np.float64).ravel()
+    kernels = compiled()
+    if kernels is not None:
+        return kernels.mix_rewards(own, observers, neighbors, lambda_).reshape(np.shape(rewards))
     count = np.bincount(observers, minlength=len(own))
     mean_of_neighbors = np.bincount(observers, own[neighbors], minlength=len(own)) / np.maximum(count, 1)
     return np.where(count > 0, lambda_ * own + (1 - lambda_) * mean_of_neighbors, own).reshape(np.shape(rewards))

@@ -58,6 +58,9 @@ class Contacts:
 
     def count(self, closer_than: float = np.inf) -> NDArray[np.int64]:
         """How many bodies each vehicle senses nearer than a distance [m] (strictly); ``(flocks, vehicles)``."""
+        kernels = compiled()
+        if kernels is not None:
+            return kernels.count_closer(self.observers, self.distances, closer_than, self._size).reshape(self.shape)
         near = self.observers if closer_than == np.inf else self.observers[self.distances < closer_than]
         counts: NDArray[np.int64] = np.bincount(near, minlength=self._size)
         return counts.reshape(self.shape)
@@ -136,13 +139,20 @@ def sense(
     :param ranges: how far vehicles sense
     :param ego_motion: :attr:`Sensing.ego_motion`; ``None`` at the start
     """
+    link_range, detection_range, shape = ranges.link_range, ranges.detection_range, positions.shape[:2]
+    if ego_motion is None:
+        ego_motion = np.zeros_like(positions)
+    kernels = compiled() if max(positions.shape[1], obstacle_positions.shape[1]) <= _FEW else None
+    if kernels is not None:
+        sensed = kernels.sense(positions, frames, obstacle_positions, waypoints, link_range, detection_range)
+        return Sensing(Contacts(shape, *sensed[0]), Contacts(shape, *sensed[1]), sensed[2], sensed[3], ego_motion)
     offsets = waypoints[:, None, :] - positions
     return Sensing(
-        neighbors=find_contacts(positions, frames, positions, ranges.link_range, exclude_self=True),
-        obstacles=find_contacts(positions, frames, obstacle_positions, ranges.detection_range),
+        neighbors=find_contacts(positions, frames, positions, link_range, exclude_self=True),
+        obstacles=find_contacts(positions, frames, obstacle_positions, detection_range),
         waypoint_positions=_to_body(offsets, frames),
         waypoint_distances=_norm(offsets),
-        ego_motion=np.zeros_like(positions) if ego_motion is None else ego_motion,
+        ego_motion=ego_motion,
     )
 
 
@@ -176,10 +186,12 @@ def find_contacts(
     :param use_numba: use numba where it is installed; the numbers are the same
     """
     shape = positions.shape[:2]
-    kernels = compiled() if use_numba and bodies.shape[1] <= _FEW else None
+    is_few = bodies.shape[1] <= _FEW
+    kernels = compiled() if use_numba else None
     if kernels is not None:
-        return Contacts(shape, *kernels.find_contacts(positions, frames, bodies, sensing_range, exclude_self))
-    pairs = _all_pairs if bodies.shape[1] <= _FEW else _pairs_by_cell
+        find = kernels.find_contacts if is_few else kernels.find_contacts_by_cell
+        return Contacts(shape, *find(positions, frames, bodies, sensing_range, exclude_self))
+    pairs = _all_pairs if is_few else _pairs_by_cell
     observers, found, offsets, distances = pairs(positions, bodies, sensing_range)
     if exclude_self:
         apart = observers % shape[1] != found

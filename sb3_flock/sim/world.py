@@ -11,7 +11,9 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from sb3_flock.settings import Coordinate, NotNegative, Positive, UserError
-from sb3_flock.sim.dynamics import directions_of, move, turn, wrap_angle
+from sb3_flock.sim import dynamics
+from sb3_flock.sim.backend import compiled
+from sb3_flock.sim.dynamics import directions_of
 from sb3_flock.sim.sensing import Sensing, SensingSettings, sense
 from sb3_flock.sim.sensors import Sensors, SensorSettings
 
@@ -122,6 +124,7 @@ class World:
         self.action_high = np.array([scenario.max_speed, scenario.max_turn_rate])
         # As large as the actions: NumPy broadcasts slowly along a last axis this short.
         shape = (n_flocks, scenario.n_vehicles, 2)
+        self._one_step = np.ones((n_flocks, 1))
         self._bounds = [np.broadcast_to(bound, shape).copy() for bound in (self.action_low, self.action_high)]
 
     @property
@@ -184,14 +187,11 @@ class World:
         scenario = self.scenario
         if self.steps >= scenario.max_cycles:
             raise RuntimeError("no episode is running: call reset() first")
-        clipped = np.clip(np.asarray(actions, dtype=np.float64), *self._bounds)
-        dt = scenario.time_step
-        self.positions = move(self.positions, self.frames, clipped[..., 0], dt)
-        self.headings = turn(self.headings, clipped[..., 1], dt)
-        self._move_obstacles(dt)
-        self.waypoints = waypoints_ahead(scenario, self.waypoints, self.steps, np.ones((self.n_flocks, 1)))[:, 0]
+        low, high = self._bounds
+        clipped = np.minimum(np.maximum(np.asarray(actions, dtype=np.float64), low), high)
+        self._move(clipped)
         self.steps += 1
-        return self.sense(clipped * dt), clipped
+        return self.sense(clipped * scenario.time_step), clipped
 
     def state_dict(self) -> dict[str, Any]:
         """The current episode: everything its next steps depend on besides the actions."""
@@ -224,14 +224,24 @@ class World:
         self.steps = int(state["steps"])
         self.sensors.load_state_dict(state["sensors"])
 
-    def _move_obstacles(self, dt: float) -> None:
-        """Unicycles with drawn speeds and turn rates, turned back at the edge of their square."""
-        bound = self.scenario.obstacle_half_side
-        speeds, turn_rates = self.obstacle_speeds[self.steps], self.obstacle_turn_rates[self.steps]
-        positions = move(self.obstacle_positions, directions_of(self.obstacle_headings), speeds, dt)
-        outside = np.maximum(np.abs(positions[..., 0]), np.abs(positions[..., 1])) > bound
-        self.obstacle_positions = np.clip(positions, -bound, bound)
-        self.obstacle_headings = wrap_angle(self.obstacle_headings + turn_rates * dt + np.pi * outside)
+    def _move(self, controls: NDArray[np.float64]) -> None:
+        """Vehicles by their controls ``(flocks, vehicles, 2)`` [m/s, rad/s], obstacles by drawn ones, and the waypoint."""
+        self.positions, self.headings, self.obstacle_positions, self.obstacle_headings = (
+            compiled() or dynamics
+        ).move_bodies(
+            self.positions,
+            self.frames,
+            self.headings,
+            controls,
+            self.obstacle_positions,
+            directions_of(self.obstacle_headings),
+            self.obstacle_headings,
+            self.obstacle_speeds[self.steps],
+            self.obstacle_turn_rates[self.steps],
+            self.scenario.time_step,
+            self.scenario.obstacle_half_side,
+        )
+        self.waypoints = waypoints_ahead(self.scenario, self.waypoints, self.steps, self._one_step)[:, 0]
 
     def _start(self, rng: Generator) -> tuple[NDArray[np.float64], ...]:
         scenario = self.scenario

@@ -26,7 +26,7 @@ def advance(world, actions):
 
 
 def without_numba(monkeypatch):
-    for module in ("sensing", "observation"):
+    for module in ("sensing", "observation", "reward", "world"):
         monkeypatch.setattr(f"sb3_flock.sim.{module}.compiled", lambda: None)
 
 

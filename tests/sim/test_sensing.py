@@ -48,7 +48,7 @@ def test_one_vehicle_and_no_obstacle_leave_empty_graphs(scenario):
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**31), st.integers(1, 3), st.integers(1, 40), st.integers(0, 20), st.floats(0.01, 0.8))
-def test_numba_all_pairs_and_the_cell_list_are_equal_to_the_last_bit(seed, flocks, vehicles, obstacles, sensing_range):
+def test_numba_all_pairs_and_the_cell_lists_are_equal_to_the_last_bit(seed, flocks, vehicles, obstacles, sensing_range):
     pytest.importorskip("numba")
     rng = np.random.default_rng(seed)
     positions, bodies = (rng.uniform(-1, 1, (flocks, count, 2)) for count in (vehicles, obstacles))
@@ -60,8 +60,8 @@ def test_numba_all_pairs_and_the_cell_list_are_equal_to_the_last_bit(seed, flock
         fast, plain = (find_contacts(*arguments, use_numba=use_numba) for use_numba in (True, False))
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(sensing, "_FEW", -1)
-            by_cells = find_contacts(*arguments)
-        for other in (plain, by_cells):
+            by_cells = [find_contacts(*arguments, use_numba=use_numba) for use_numba in (True, False)]
+        for other in (plain, *by_cells):
             for name in ("observers", "bodies", "positions", "distances"):
                 np.testing.assert_array_equal(getattr(fast, name), getattr(other, name))
         distances = np.concatenate([block for _, block in distance_blocks(positions, sensed, exclude_self)], axis=1)
