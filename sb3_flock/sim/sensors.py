@@ -93,6 +93,11 @@ class Sensors:
         self._measured.append(measured)
         return self._measured[0]
 
+    @property
+    def latest(self) -> Sensing | None:
+        """What :meth:`measure` returned last; ``None`` at the start, and where it returns what there is."""
+        return self._measured[0] if self._measured else None
+
     def state_dict(self) -> dict[str, Any]:
         """The random streams, the memory and the delayed measurements: plain values and arrays."""
         return {

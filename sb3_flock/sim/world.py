@@ -12,8 +12,9 @@ from pydantic import Field, model_validator
 
 from sb3_flock.settings import Coordinate, NotNegative, Positive, UserError
 from sb3_flock.sim.dynamics import directions_of, move, turn, wrap_angle
-from sb3_flock.sim.sensing import Sensing, SensingSettings, sense
-from sb3_flock.sim.sensors import Sensors, SensorSettings
+from sb3_flock.sim.safety import SafetySettings, filter_actions
+from sb3_flock.sim.sensing import Sensing, sense
+from sb3_flock.sim.sensors import Sensors
 
 if TYPE_CHECKING:
     from numpy.random import Generator
@@ -30,7 +31,7 @@ Points = Annotated[tuple[tuple[Coordinate, Coordinate], ...], Field(min_length=1
 """Positions ``[[x, y], ...]`` [m]."""
 
 
-class WorldSettings(SensingSettings, SensorSettings):
+class WorldSettings(SafetySettings):
     """The arena, the starts and the waypoint (section V)."""
 
     waypoint_speed: NotNegative = Field(0.1, description="speed of the waypoint towards the origin [m/s] (paper: 0.1)")
@@ -178,20 +179,22 @@ class World:
         """Move every body by one sampling period, vehicles, obstacles and waypoint together (section III-A).
 
         :param actions: ``(flocks, vehicles, 2)``, speed v [m/s] and turn rate omega [rad/s], clipped to their bounds
-        :return: what the vehicles sense afterwards, and the clipped actions
+        :return: what the vehicles sense afterwards, and the executed actions: clipped, and filtered where the scenario says so
         :raises RuntimeError: before a reset or after the episode's last step
         """
         scenario = self.scenario
         if self.steps >= scenario.max_cycles:
             raise RuntimeError("no episode is running: call reset() first")
-        clipped = np.clip(np.asarray(actions, dtype=np.float64), *self._bounds)
+        executed = np.clip(np.asarray(actions, dtype=np.float64), *self._bounds)
+        if scenario.is_filtered:
+            executed = filter_actions(executed, self.sensors.latest or self.sense(), scenario, self.frames)
         dt = scenario.time_step
-        self.positions = move(self.positions, self.frames, clipped[..., 0], dt)
-        self.headings = turn(self.headings, clipped[..., 1], dt)
+        self.positions = move(self.positions, self.frames, executed[..., 0], dt)
+        self.headings = turn(self.headings, executed[..., 1], dt)
         self._move_obstacles(dt)
         self.waypoints = waypoints_ahead(scenario, self.waypoints, self.steps, np.ones((self.n_flocks, 1)))[:, 0]
         self.steps += 1
-        return self.sense(clipped * dt), clipped
+        return self.sense(executed * dt), executed
 
     def state_dict(self) -> dict[str, Any]:
         """The current episode: everything its next steps depend on besides the actions."""
