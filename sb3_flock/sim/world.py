@@ -188,6 +188,7 @@ class World:
         executed = np.clip(np.asarray(actions, dtype=np.float64), *self._bounds)
         if scenario.is_filtered:
             executed = filter_actions(executed, self.sensors.latest or self.sense(), scenario, self.frames)
+        self.sensors.latest = None
         dt = scenario.time_step
         self.positions = move(self.positions, self.frames, executed[..., 0], dt)
         self.headings = turn(self.headings, executed[..., 1], dt)
