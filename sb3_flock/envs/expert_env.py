@@ -22,7 +22,7 @@ class ExpertEnv(parallel_env):
 
     * ``expert_drives``: whether the expert drives this episode;
     * ``executed_action``: in its episodes, the executed action ``(2,)`` [m/s, rad/s], which
-      :class:`~sb3_flock.rl.callbacks.StoreExecutedActions` stores in place of the policy's;
+      :class:`~sb3_flock.rl.callbacks.StoreExecutedActions` stores in place of the policy's, before a safety filter;
     * ``expert_action``: with ``queries``, what the expert would do, ``(2,)`` [m/s, rad/s], in every episode.
 
     :param scenario: the task

@@ -5,11 +5,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sb3_flock.envs import flocking_v0
 from sb3_flock.settings import SettingsError
 from sb3_flock.sim import Scenario, World, episode_rng, safety
 from sb3_flock.sim.safety import filter_actions
 from sb3_flock.sim.sensing import nearest
-from tests.helpers import place
+from tests.helpers import assert_copy_continues_alike, place
 
 FILTERS = ["voronoi", "motion", "heading", "announce"]
 LAG = 0.2
@@ -125,6 +126,28 @@ def test_the_filter_uses_what_the_vehicles_measure():
     world = place(scenario, [(0.0, 0.0), (0.11, 0.0)], [0.0, np.pi])
     world.sensors.measure(world.sense())
     assert (world.step(np.full((1, 2, 2), (0.15, 0.0)))[1][..., 0] == 0.15).all()
+
+
+@pytest.mark.parametrize("safety_filter", FILTERS)
+@pytest.mark.parametrize("errors", [{}, {"position_noise": 0.01, "dropout": 0.1, "delay": 0.2}])
+def test_an_episode_restored_from_its_state_is_filtered_alike(safety_filter, errors):
+    """The filter uses the last measurement, also right after the state was restored."""
+    env = flocking_v0.parallel_env(filtered(safety_filter, n_vehicles=10, arena=0.3, obstacle_arena=1.0, sensors=errors))
+    env.reset(seed=0)
+    actions = dict.fromkeys(env.possible_agents, np.array([0.15, 0.5], np.float32))
+    for _ in range(5):
+        env.step(actions)
+    assert_copy_continues_alike(env, actions, 20)
+
+
+def test_the_reward_charges_the_executed_action():
+    """Vehicles that are stopped pay nothing for the speed that they asked for."""
+    env = flocking_v0.parallel_env(filtered("voronoi", n_vehicles=2))
+    env.reset(seed=0)
+    env.world.positions, env.world.headings = np.array([[(0.0, 0.0), (0.1, 0.0)]]), np.array([[0.0, -np.pi]])
+    env.world.sensors.forget()
+    infos = env.step(dict.fromkeys(env.agents, np.array([0.15, 0.0], np.float32)))[-1]
+    assert [info["reward_terms"]["control"] for info in infos.values()] == [0.0, 0.0]
 
 
 # Drivers that provoke violations: each maps a world and a generator to actions.
