@@ -21,7 +21,7 @@ _LEVELS = ("voronoi", "motion")
 class SafetyFilter(Controller):
     """Drives by another controller, with speeds bounded by :func:`~sb3_flock.sim.safety.filter_actions`.
 
-    A controller senses no headings, so two levels are possible. The promise of ``docs/safety.md`` holds if all vehicles are
+    A controller senses no headings, so two levels are possible. The guarantee of ``docs/safety.md`` holds if all vehicles are
     filtered, sense exactly, and move as the task's unicycles do.
 
     :param controller: a controller, or anything with SB3's ``predict``

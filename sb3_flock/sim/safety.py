@@ -3,7 +3,7 @@
 A unicycle moves along its present heading, never backwards, and may stop within a step. The share of vehicle i's heading
 towards neighbor j at distance d is cos_i. Each pair has a budget d - r_n', which i and j divide among them, and each bounds
 its own approach v_i cos_i dt by its part. The new offset, projected on the old line, is then at least r_n'. ``docs/safety.md``
-has the proof, what each level needs to know, and what can be promised about obstacles.
+has the proof, what each level needs to know, and what can be guaranteed about obstacles.
 """
 
 from __future__ import annotations

@@ -141,7 +141,7 @@ def test_an_episode_restored_from_its_state_is_filtered_alike(safety_filter, err
 
 
 def test_the_reward_charges_the_executed_action():
-    """Vehicles that are stopped pay nothing for the speed that they asked for."""
+    """Vehicles that are stopped have no penalty for the speed that they asked for."""
     env = flocking_v0.parallel_env(filtered("voronoi", n_vehicles=2))
     env.reset(seed=0)
     env.world.positions, env.world.headings = np.array([[(0.0, 0.0), (0.1, 0.0)]]), np.array([[0.0, -np.pi]])
@@ -252,6 +252,22 @@ def provoke(vehicle_steps, seed):
 def test_no_pair_ends_a_step_nearer_than_its_separation(seed, n_vehicles, safety_filter, driver, is_packed):
     rng = np.random.default_rng(seed)
     simulate(random_task(rng, n_vehicles, safety_filter), driver, 2, seed, is_packed)
+
+
+@pytest.mark.parametrize("safety_filter", FILTERS)
+@pytest.mark.parametrize("driver", DRIVERS)
+def test_vehicles_that_start_too_near_come_no_nearer(driver, safety_filter):
+    scenario = filtered(safety_filter, n_vehicles=20, n_obstacles=0)
+    rng, world = np.random.default_rng(0), World(scenario, 5)
+    world.reset([episode_rng(3, episode) for episode in range(5)])
+    world.positions = world.positions * 0.2
+    sensing, apart = world.sense(), None
+    for _ in range(50):
+        world.sensors.measure(sensing)
+        before, apart = apart, np.linalg.norm(world.positions[:, None] - world.positions[:, :, None], axis=-1)
+        if before is not None:
+            assert (apart >= np.minimum(before, scenario.neighbor_separation)).all()
+        sensing, _ = world.step(driver(world, rng))
 
 
 @pytest.mark.parametrize("safety_filter", ["off", "announce"])
