@@ -21,7 +21,7 @@ class ExpertEnv(parallel_env):
     expert drives, and the noise on its actions, are drawn from the env's own random stream. The infos of a step also hold:
 
     * ``expert_drives``: whether the expert drives this episode;
-    * ``executed_action``: in its episodes, the executed action ``(2,)`` [m/s, rad/s], which
+    * ``executed_action``: in its episodes, the executed action ``(2,)`` [m/s, rad/s], unfiltered, which
       :class:`~sb3_flock.rl.callbacks.StoreExecutedActions` stores in place of the policy's;
     * ``expert_action``: with ``queries``, what the expert would do, ``(2,)`` [m/s, rad/s], in every episode.
 

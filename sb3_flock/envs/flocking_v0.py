@@ -132,8 +132,8 @@ class parallel_env(ParallelEnv[str, Observation, Action]):  # noqa: N801 - Petti
         self, actions: dict[str, Action]
     ) -> tuple[dict[str, Observation], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
         """Move everything by one sampling period; see the module's page for what comes back."""
-        sensing, clipped = self.world.step([[actions[agent] for agent in self.agents]])
-        by_name = reward_terms(sensing, clipped, self.scenario.reward, self.scenario)
+        sensing, executed = self.world.step([[actions[agent] for agent in self.agents]])
+        by_name = reward_terms(sensing, executed, self.scenario.reward, self.scenario)
         terms = {name: term[0] for name, term in by_name.items()}
         truncated = self.world.steps >= self.scenario.max_cycles
         infos = self._infos(sensing, terms, truncated)

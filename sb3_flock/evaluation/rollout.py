@@ -49,8 +49,8 @@ def rollout_batch(
     metrics = EpisodeMetrics(scenario, len(rngs))
     world, sensing, controller = _start(make_controller, scenario, rngs)
     for _ in range(scenario.max_cycles):
-        sensing, clipped = world.step(controller.act(world.sensors.measure(sensing), scenario))
-        metrics.update(world, sensing, own_reward(reward_terms(sensing, clipped, scenario.reward, scenario)))
+        sensing, executed = world.step(controller.act(world.sensors.measure(sensing), scenario))
+        metrics.update(world, sensing, own_reward(reward_terms(sensing, executed, scenario.reward, scenario)))
     return metrics.result()
 
 

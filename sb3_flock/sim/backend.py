@@ -8,9 +8,9 @@ from types import ModuleType
 
 
 @functools.cache
-def compiled() -> ModuleType | None:
-    """:mod:`sb3_flock.sim.kernels`, or ``None`` where numba (the ``fast`` extra) is not installed."""
+def compiled(module: str = "kernels") -> ModuleType | None:
+    """A module of ``sb3_flock.sim`` with kernels, or ``None`` where numba (the ``fast`` extra) is not installed."""
     try:
-        return importlib.import_module("sb3_flock.sim.kernels")
+        return importlib.import_module(f"sb3_flock.sim.{module}")
     except (ImportError, RuntimeError):  # RuntimeError: there is no folder where numba may keep its cache
         return None

@@ -32,7 +32,7 @@ _OWN_TERMS = ("connectivity", "obstacle", "waypoint", "control")
 def register_reward_term(name: str) -> Callable[[RewardTerm], RewardTerm]:
     """Register a further reward term under a name, as a decorator.
 
-    The function gets what every vehicle senses after the step, the clipped actions ``(flocks, vehicles, 2)`` [m/s, rad/s] and
+    The function gets what every vehicle senses after the step, the executed actions ``(flocks, vehicles, 2)`` [m/s, rad/s] and
     the sensing ranges. It returns the unweighted term, ``(flocks, vehicles)``.
 
     :raises ValueError: if a term has the name already
@@ -92,7 +92,7 @@ def reward_terms(
     """The terms of r_i, weighted and scaled, so that their sum is r_i (section IV-B).
 
     :param sensing: what every vehicle senses after the step
-    :param actions: ``(flocks, vehicles, 2)`` [m/s, rad/s], the clipped actions of the step
+    :param actions: ``(flocks, vehicles, 2)`` [m/s, rad/s], the executed actions of the step
     :param weights: the weights
     :param ranges: the sensing ranges and minimum separations
     :return: ``connectivity``, ``obstacle``, ``waypoint``, ``control`` and the extra terms, each ``(flocks, vehicles)``

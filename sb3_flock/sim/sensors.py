@@ -67,6 +67,8 @@ class Sensors:
     def __init__(self, settings: SensorSettings) -> None:
         self.errors = settings.sensors
         self.is_exact = self.errors == SensorErrors()
+        self.latest: Sensing | None = None
+        """What :meth:`measure` returned since the last step of the world."""
         self._rngs: list[Generator] = []
         self._history: deque[Sensing] = deque(maxlen=1 + settings.motion_lag_steps)
         self._measured: deque[Sensing] = deque(maxlen=1 + round(self.errors.delay / settings.time_step))
@@ -79,11 +81,16 @@ class Sensors:
 
     def forget(self) -> None:
         """Drop everything measured so far, for a world whose bodies have changed."""
+        self.latest = None
         self._history.clear()
         self._measured.clear()
 
     def measure(self, truth: Sensing) -> Sensing:
         """What the vehicles act on; call this once a step. Until the delay is over, that is the first measurement."""
+        self.latest = self._measure(truth)
+        return self.latest
+
+    def _measure(self, truth: Sensing) -> Sensing:
         has_memory = self._history.maxlen != 1
         if self.is_exact and not has_memory:
             return truth
@@ -109,6 +116,7 @@ class Sensors:
         for kept, saved in ((self._history, state["history"]), (self._measured, state["measured"])):
             kept.clear()
             kept.extend(_sensing(sensing) for sensing in saved)
+        self.latest = self._measured[0] if self._measured else None
 
     def _with_previous(self, measured: Sensing) -> Sensing:
         """Adds what was measured ``motion_lag`` ago, or at the start, in the vehicles' present frames."""

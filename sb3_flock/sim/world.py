@@ -14,8 +14,9 @@ from sb3_flock.settings import Coordinate, NotNegative, Positive, UserError
 from sb3_flock.sim import dynamics
 from sb3_flock.sim.backend import compiled
 from sb3_flock.sim.dynamics import directions_of
-from sb3_flock.sim.sensing import Sensing, SensingSettings, sense
-from sb3_flock.sim.sensors import Sensors, SensorSettings
+from sb3_flock.sim.safety import SafetySettings, filter_actions
+from sb3_flock.sim.sensing import Sensing, sense
+from sb3_flock.sim.sensors import Sensors
 
 if TYPE_CHECKING:
     from numpy.random import Generator
@@ -32,7 +33,7 @@ Points = Annotated[tuple[tuple[Coordinate, Coordinate], ...], Field(min_length=1
 """Positions ``[[x, y], ...]`` [m]."""
 
 
-class WorldSettings(SensingSettings, SensorSettings):
+class WorldSettings(SafetySettings):
     """The arena, the starts and the waypoint (section V)."""
 
     waypoint_speed: NotNegative = Field(0.1, description="speed of the waypoint towards the origin [m/s] (paper: 0.1)")
@@ -181,17 +182,20 @@ class World:
         """Move every body by one sampling period, vehicles, obstacles and waypoint together (section III-A).
 
         :param actions: ``(flocks, vehicles, 2)``, speed v [m/s] and turn rate omega [rad/s], clipped to their bounds
-        :return: what the vehicles sense afterwards, and the clipped actions
+        :return: what the vehicles sense afterwards, and the executed actions: clipped, and filtered where the scenario says so
         :raises RuntimeError: before a reset or after the episode's last step
         """
         scenario = self.scenario
         if self.steps >= scenario.max_cycles:
             raise RuntimeError("no episode is running: call reset() first")
         low, high = self._bounds
-        clipped = np.minimum(np.maximum(np.asarray(actions, dtype=np.float64), low), high)
-        self._move(clipped)
+        executed = np.minimum(np.maximum(np.asarray(actions, dtype=np.float64), low), high)
+        if scenario.is_filtered:
+            executed = filter_actions(executed, self.sensors.latest or self.sense(), scenario, self.frames)
+        self.sensors.latest = None
+        self._move(executed)
         self.steps += 1
-        return self.sense(clipped * scenario.time_step), clipped
+        return self.sense(executed * scenario.time_step), executed
 
     def state_dict(self) -> dict[str, Any]:
         """The current episode: everything its next steps depend on besides the actions."""
