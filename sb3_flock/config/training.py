@@ -119,7 +119,8 @@ class TrainingConfig(ModelSettings, TaskConfig):
         0,
         ge=0,
         le=1024,
-        description="torch threads; 0: one for batches under 1024, where more are no faster, else one per core",
+        description="threads of torch, and of the compiled update, which has two at most; 0: of torch one for batches under "
+        "1024, where more are no faster, else one per core, and of the update two where there are two cores",
     )
 
     eval_freq: Count = Field(10_000, description="transitions between evaluations; 0: none")

@@ -54,13 +54,14 @@ class CompiledUpdate:
         self._blas = ThreadpoolController().select(user_api="blas")
 
     def __call__(
-        self, n_updates: int, batch_size: int, updates_before: int = 0, bc_coef: float = 0.0
+        self, n_updates: int, batch_size: int, updates_before: int = 0, bc_coef: float = 0.0, threads: int = 0
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Update the networks ``n_updates`` times.
 
         :param batch_size: transitions in a minibatch
         :param updates_before: updates so far, which decide when TD3 updates the actor
         :param bc_coef: weight of the behavior cloning term in the actor's loss
+        :param threads: as in :func:`update_threads`
         :return: the critics' losses; the actor's, for each of its updates; its behavior cloning losses, if there is such a term
         """
         model = self.model
@@ -71,6 +72,7 @@ class CompiledUpdate:
         updates_actor = (updates_before + 1 + np.arange(n_updates)) % model.policy_delay == 0
         losses = np.zeros((n_updates, 3))
         self._run(
+            update_threads(threads),
             shapes,
             self._learned("actor"),
             self._learned("critic"),
@@ -93,9 +95,9 @@ class CompiledUpdate:
                 state["step"] += count
         return losses[:, 0], losses[updates_actor, 1], losses[updates_actor, 2] if bc_coef else np.empty(0)
 
-    def _run(self, *arguments: Any) -> None:
-        """Run :func:`~sb3_flock.rl.update_kernels.update` in as many threads as there may be."""
-        update, threads, barrier = self.kernels.update, update_threads(), self.kernels.new_barrier()
+    def _run(self, threads: int, *arguments: Any) -> None:
+        """Run :func:`~sb3_flock.rl.update_kernels.update` in one thread or two."""
+        update, barrier = self.kernels.update, self.kernels.new_barrier()
         with self._blas.limit(limits=1):
             if threads == 1:
                 update(0, 1, barrier, *arguments)
@@ -196,10 +198,11 @@ def _is_plain_adam(optimizer: th.optim.Optimizer) -> bool:
     return type(optimizer) is th.optim.Adam and len(groups) == 1 and all(groups[0][k] == v for k, v in default.items())
 
 
-def update_threads() -> int:
-    """Threads that an update uses: two where the process may use two cores, unless ``OMP_NUM_THREADS`` is 1."""
-    has_barrier = os.name == "posix"
-    return 2 if has_barrier and cores() > 1 and os.environ.get("OMP_NUM_THREADS") != "1" else 1
+def update_threads(wanted: int = 0) -> int:
+    """Threads of an update: one or two, as wanted; 0: two where the process may use two cores, unless OMP_NUM_THREADS is 1."""
+    if os.name != "posix":  # the barrier yields the core by sched_yield
+        return 1
+    return min(wanted or (2 if cores() > 1 and os.environ.get("OMP_NUM_THREADS") != "1" else 1), HALVES)
 
 
 def cores() -> int:

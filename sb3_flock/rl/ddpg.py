@@ -24,9 +24,13 @@ class FlockTD3(TD3):
         otherwise, and if this is false, by torch
 
     The other parameters are those of SB3's ``TD3``.
+
+    :ivar update_threads: threads of the compiled update, 1 or 2, which end at the same bits; 0: two where the process may use
+        two cores, unless the environment variable ``OMP_NUM_THREADS`` is 1
     """
 
     bc_coef = 0.0
+    update_threads = 0
 
     def __init__(self, *args: Any, compiled: bool = True, **kwargs: Any) -> None:
         self.compiled = compiled
@@ -34,7 +38,7 @@ class FlockTD3(TD3):
         super().__init__(*args, **kwargs)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_update"]
+        return [*super()._excluded_save_params(), "_update", "update_threads"]
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
         """Update the networks from the replay buffer (Algorithm 1 of the paper; one target network each)."""
@@ -44,7 +48,7 @@ class FlockTD3(TD3):
         self.policy.set_training_mode(True)
         self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
         self._update = self._update or CompiledUpdate(self)
-        losses = self._update(gradient_steps, batch_size, self._n_updates, self.bc_coef)
+        losses = self._update(gradient_steps, batch_size, self._n_updates, self.bc_coef, self.update_threads)
         self._n_updates += gradient_steps
         self._log_losses(*losses)
 

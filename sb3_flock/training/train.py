@@ -29,6 +29,7 @@ from sb3_flock.rl.callbacks import (
     StoreExecutedActions,
 )
 from sb3_flock.rl.compiled_update import cores
+from sb3_flock.rl.ddpg import FlockTD3
 from sb3_flock.rl.registry import build_model
 from sb3_flock.serialization.load import PolicyError, check_device, checkpoint_paths, load_policy
 from sb3_flock.serialization.save import save_model
@@ -288,6 +289,8 @@ def _build(config: TrainingConfig, env: VecEnv) -> OffPolicyAlgorithm:
         model = build_model(config, env)
     except MemoryError:
         raise SettingsError(f"buffer_size = {config.algorithm.buffer_size}: more than this machine's memory") from None
+    if isinstance(model, FlockTD3):
+        model.update_threads = config.torch_threads
     if config.init_from is not None:
         initial = load_policy(config.init_from)
         initial.check(config.scenario)

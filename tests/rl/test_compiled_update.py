@@ -71,13 +71,16 @@ def test_no_updates_change_nothing():
     assert all(th.equal(tensor, before[name]) for name, tensor in model.policy.state_dict().items())
 
 
-@pytest.mark.parametrize(("available", "omp", "expected"), [(1, None, 1), (2, None, 2), (8, "4", 2), (8, "1", 1)])
-def test_two_threads_where_two_cores_may_be_used(monkeypatch, available, omp, expected):
+@pytest.mark.parametrize(
+    ("available", "omp", "wanted", "expected"),
+    [(1, None, 0, 1), (2, None, 0, 2), (8, "4", 0, 2), (8, "1", 0, 1), (8, "1", 2, 2), (1, None, 4, 2), (8, None, 1, 1)],
+)
+def test_two_threads_where_two_cores_may_be_used(monkeypatch, available, omp, wanted, expected):
     monkeypatch.setattr(compiled_update, "cores", lambda: available)
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     if omp:
         monkeypatch.setenv("OMP_NUM_THREADS", omp)
-    assert update_threads() == expected
+    assert update_threads(wanted) == expected
 
 
 def test_this_process_may_use_a_core():

@@ -3,7 +3,6 @@
 import pytest
 import torch as th
 
-from sb3_flock.rl import compiled_update
 from sb3_flock.rl.compiled_update import can_compile
 from tests.rl.filled_models import UPDATES, filled, updated
 
@@ -51,11 +50,12 @@ def test_thirty_updates_end_where_torch_ends(options):
 
 
 @pytest.mark.parametrize("algo", ["ddpg", "td3"])
-def test_one_thread_and_two_end_at_the_same_bits(monkeypatch, algo):
+def test_one_thread_and_two_end_at_the_same_bits(algo):
     ends = []
     for threads in (1, 2):
-        monkeypatch.setattr(compiled_update, "update_threads", lambda threads=threads: threads)
-        ends.append(updated(filled(algo=algo)))
+        model = filled(algo=algo)
+        model.update_threads = threads
+        ends.append(updated(model))
     for a, b in zip(*(model.policy.parameters() for model in ends), strict=True):
         assert th.equal(a, b)
     for name in ("train/actor_loss", "train/critic_loss"):

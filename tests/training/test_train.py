@@ -83,8 +83,9 @@ def test_the_best_model_is_the_one_with_the_lowest_score(tmp_path):
 
 @pytest.mark.parametrize(("threads", "batch_size", "expected"), [(0, 128, 1), (0, 1024, cores()), (2, 128, 2)])
 def test_torch_threads_follow_the_batch_and_the_cores_unless_given(tmp_path, threads, batch_size, expected):
-    train(tiny(tmp_path, torch_threads=threads, batch_size=batch_size, eval_freq=0, save_freq=0), quiet())
+    result = train(tiny(tmp_path, torch_threads=threads, batch_size=batch_size, eval_freq=0, save_freq=0), quiet())
     assert th.get_num_threads() == expected
+    assert result.model.update_threads == threads
 
 
 def test_one_seed_trains_the_same_policy_twice_and_another_a_different_one(tmp_path):
