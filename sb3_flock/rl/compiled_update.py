@@ -28,9 +28,6 @@ if TYPE_CHECKING:
 
     from sb3_flock.rl.update_kernels import Batches, Learned, Replay, Shapes, Workspace
 
-HALVES = 2
-"""Parts of a minibatch, whose gradients are added."""
-
 
 class CompiledUpdate:
     """Updates a model of DDPG or TD3 by :func:`sb3_flock.rl.update_kernels.update`.
@@ -50,8 +47,14 @@ class CompiledUpdate:
         self._moments: dict[str, list[th.Tensor]] = {}
         self._gradients: dict[str, NDArray[np.float32]] = {}
         self._memory: dict[int, tuple[Shapes, Workspace]] = {}
-        self._second_thread = ThreadPoolExecutor(1, "update")
         self._blas = ThreadpoolController().select(user_api="blas")
+
+    def __getstate__(self) -> dict[str, Any]:
+        """A copy of the model gets flat memory of its own at its next update."""
+        return {"model": self.model}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(**state)  # type: ignore[misc]
 
     def __call__(
         self, n_updates: int, batch_size: int, updates_before: int = 0, bc_coef: float = 0.0, threads: int = 0
@@ -97,12 +100,15 @@ class CompiledUpdate:
 
     def _run(self, threads: int, *arguments: Any) -> None:
         """Run :func:`~sb3_flock.rl.update_kernels.update` in one thread or two."""
-        update, barrier = self.kernels.update, self.kernels.new_barrier()
+        from sb3_flock.rl.barrier_kernels import new_barrier
+
+        update, barrier = self.kernels.update, new_barrier()
         with self._blas.limit(limits=1):
             if threads == 1:
                 update(0, 1, barrier, *arguments)
-            else:
-                second = self._second_thread.submit(update, 1, 2, barrier, *arguments)
+                return
+            with ThreadPoolExecutor(1) as pool:
+                second = pool.submit(update, 1, 2, barrier, *arguments)
                 update(0, 2, barrier, *arguments)
                 second.result()
 
@@ -150,7 +156,7 @@ class CompiledUpdate:
             flat = self._flat[name] = th.cat([parameter.detach().reshape(-1) for parameter in parameters])
             for parameter, part in zip(parameters, _split(flat, parameters), strict=True):
                 parameter.data = part
-            self._gradients[name] = np.zeros((HALVES, len(flat)), np.float32)
+            self._gradients[name] = np.zeros((self.kernels.HALVES, len(flat)), np.float32)
         return flat.numpy()
 
     def _flatten_moments(self, name: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -202,7 +208,7 @@ def update_threads(wanted: int = 0) -> int:
     """Threads of an update: one or two, as wanted; 0: two where the process may use two cores, unless OMP_NUM_THREADS is 1."""
     if os.name != "posix":  # the barrier yields the core by sched_yield
         return 1
-    return min(wanted or (2 if cores() > 1 and os.environ.get("OMP_NUM_THREADS") != "1" else 1), HALVES)
+    return min(wanted or (2 if cores() > 1 and os.environ.get("OMP_NUM_THREADS") != "1" else 1), 2)
 
 
 def cores() -> int:
@@ -272,7 +278,7 @@ def _shapes(model: TD3, batch_size: int) -> Shapes:
 
 
 def _workspace(shapes: Shapes, n_actions: int) -> Workspace:
-    from sb3_flock.rl.update_kernels import Workspace
+    from sb3_flock.rl.update_kernels import HALVES, Workspace
 
     n, area = (shapes.batch + 1) // HALVES, shapes.kernel_size**2
     outputs = [channels * positions for channels, _, positions, _ in shapes.convolutions.tolist()]

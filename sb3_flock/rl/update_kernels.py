@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from sb3_flock.rl.barrier_kernels import new_barrier, wait_for_other  # noqa: F401 - the caller makes the barrier
+from sb3_flock.rl.barrier_kernels import wait_for_other
 from sb3_flock.rl.layer_kernels import (
     ONE,
     ZERO,
@@ -41,6 +41,7 @@ from sb3_flock.rl.layer_kernels import (
 )
 
 HALVES = 2
+"""Parts of a minibatch, whose gradients are added."""
 
 _options: dict[str, Any] = {"error_model": "numpy", "cache": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 _kernel = njit(**_options)

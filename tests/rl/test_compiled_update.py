@@ -48,6 +48,17 @@ def test_torchs_updates_continue_where_compiled_ones_end():
         th.testing.assert_close(a, b, rtol=0, atol=3e-5)
 
 
+def test_a_copy_of_a_model_is_updated_by_itself():
+    model = updated(filled(), 10)
+    twin = deepcopy(model)
+    before = model.policy.state_dict()["actor.mu.0.weight"].clone()
+    updated(twin, 10)
+    assert th.equal(model.policy.state_dict()["actor.mu.0.weight"], before)
+    updated(model, 10)
+    for a, b in zip(model.policy.parameters(), twin.policy.parameters(), strict=True):
+        assert th.equal(a, b)
+
+
 @pytest.mark.parametrize("change", ["weight_decay", "no fast extra", "another buffer"])
 def test_without_the_parts_torch_updates(monkeypatch, change):
     model = filled()
