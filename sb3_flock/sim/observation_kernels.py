@@ -17,7 +17,7 @@ from numba.extending import intrinsic
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-_BLOCK = 256
+_BLOCK = 128
 """Vehicles whose channels are all filled before the next vehicles'."""
 
 _LANES = 16
