@@ -51,7 +51,9 @@ def rasterize(
     :param row: as many numbers as a row has anchors: numba knows a tuple's length at compile time and unrolls the loops
     """
     n_channels, side, flat = len(counts), len(row), channels.reshape(-1)
-    ends = np.cumsum(counts)
+    ends = counts.copy()
+    for channel in range(1, n_channels):
+        ends[channel] += ends[channel - 1]
     following = ends - counts  # each channel's next body
     first = np.empty(n_channels, np.int64)  # the row of its factors
     of_vehicle = np.empty((_BLOCK, n_channels), np.int64)  # number of bodies
