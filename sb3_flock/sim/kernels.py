@@ -207,6 +207,38 @@ def count_closer(
 
 
 @njit(error_model="numpy", cache=True)
+def own_terms(
+    neighbor_observers: NDArray[np.int64],
+    neighbor_distances: NDArray[np.float64],
+    obstacle_observers: NDArray[np.int64],
+    obstacle_distances: NDArray[np.float64],
+    waypoint_distances: NDArray[np.float64],
+    actions: NDArray[np.float64],
+    separations: tuple[float, float],
+    weights: tuple[float, float, float, float, float],
+    max_distance: float,
+    scale: float,
+) -> NDArray[np.float64]:
+    """:func:`sb3_flock.sim.reward.own_terms` in one pass."""
+    link_bonus, separation_penalty, obstacle_penalty, epsilon, beta = weights
+    n_vehicles = waypoint_distances.shape[1]
+    counts = count_closer(neighbor_observers, neighbor_distances, np.inf, waypoint_distances.size)
+    violations = count_closer(neighbor_observers, neighbor_distances, separations[0], waypoint_distances.size)
+    near_obstacles = count_closer(obstacle_observers, obstacle_distances, separations[1], waypoint_distances.size)
+    terms = np.empty((4, *waypoint_distances.shape))
+    for flock in range(len(waypoint_distances)):
+        for i in range(n_vehicles):
+            k = flock * n_vehicles + i
+            linked = counts[k] - violations[k]
+            speed, turn_rate = actions[flock, i, 0], actions[flock, i, 1]
+            terms[0, flock, i] = scale * (link_bonus * linked - separation_penalty * violations[k])
+            terms[1, flock, i] = scale * (-obstacle_penalty * near_obstacles[k])
+            terms[2, flock, i] = scale * (-epsilon * min(waypoint_distances[flock, i], max_distance))
+            terms[3, flock, i] = scale * (beta * (speed * speed + turn_rate * turn_rate))
+    return terms
+
+
+@njit(error_model="numpy", cache=True)
 def mix_rewards(
     own: NDArray[np.float64], observers: NDArray[np.int64], neighbors: NDArray[np.int64], lambda_: float
 ) -> NDArray[np.float64]:

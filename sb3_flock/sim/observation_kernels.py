@@ -17,8 +17,11 @@ from numba.extending import intrinsic
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-_BLOCK = 256
+_BLOCK = 128
 """Vehicles whose channels are all filled before the next vehicles'."""
+
+_AHEAD = 1024
+"""Single-precision numbers between what is written and the cache lines that are fetched for later writing."""
 
 _LANES = 16
 """Numbers in a vector; rows of factors are padded with zeros to a multiple of it."""
@@ -48,7 +51,9 @@ def rasterize(
     :param row: as many numbers as a row has anchors: numba knows a tuple's length at compile time and unrolls the loops
     """
     n_channels, side, flat = len(counts), len(row), channels.reshape(-1)
-    ends = np.cumsum(counts)
+    ends = counts.copy()
+    for channel in range(1, n_channels):
+        ends[channel] += ends[channel - 1]
     following = ends - counts  # each channel's next body
     first = np.empty(n_channels, np.int64)  # the row of its factors
     of_vehicle = np.empty((_BLOCK, n_channels), np.int64)  # number of bodies
@@ -168,6 +173,9 @@ def _store_sum_of_products(
         along_x = array.data
         along_y = builder.gep(along_x, [builder.mul(builder.extract_value(array.shape, 1), constant(width))])
 
+        _prefetch(
+            builder, [builder.gep(base, [builder.add(arguments[1], constant(_AHEAD + k))]) for k in range(0, side**2, 16)]
+        )
         before = builder.block
         test, add, store = (builder.append_basic_block(name) for name in ("test", "add", "store"))
         builder.branch(test)
@@ -198,6 +206,16 @@ def _store_sum_of_products(
         return context.get_dummy_value()
 
     return types.void(out, types.intp, factors, types.intp, types.intp, row), generate
+
+
+def _prefetch(builder: Any, pointers: list[Any]) -> None:
+    """Fetch cache lines that will be written; beyond the end of an array this does nothing."""
+    address, number = ir.IntType(8).as_pointer(), ir.IntType(32)
+    signature = ir.FunctionType(ir.VoidType(), [address, number, number, number])
+    prefetch = builder.module.declare_intrinsic("llvm.prefetch", [address], signature)
+    to_write, to_second_level, data = (ir.Constant(number, value) for value in (1, 2, 1))
+    for pointer in pointers:
+        builder.call(prefetch, [builder.bitcast(pointer, address), to_write, to_second_level, data])
 
 
 def _exp(builder: Any, t: Any) -> Any:

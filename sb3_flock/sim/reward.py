@@ -97,18 +97,63 @@ def reward_terms(
     :param ranges: the sensing ranges and minimum separations
     :return: ``connectivity``, ``obstacle``, ``waypoint``, ``control`` and the extra terms, each ``(flocks, vehicles)``
     """
-    distances = np.minimum(sensing.waypoint_distances, np.inf if weights.max_distance is None else weights.max_distance)
-    violations = sensing.neighbors.count(ranges.neighbor_separation)
-    linked = sensing.neighbors.count() - violations
-    terms = {
-        "connectivity": weights.link_bonus * linked - weights.separation_penalty * violations,
-        "obstacle": -weights.obstacle_penalty * sensing.obstacles.count(ranges.obstacle_separation),
-        "waypoint": -weights.epsilon * distances,
-        "control": weights.beta * (np.square(actions[..., 0]) + np.square(actions[..., 1])),
-    }
+    kernels = compiled()
+    compute = own_terms if kernels is None else kernels.own_terms
+    own = compute(
+        sensing.neighbors.observers,
+        sensing.neighbors.distances,
+        sensing.obstacles.observers,
+        sensing.obstacles.distances,
+        sensing.waypoint_distances,
+        actions,
+        (ranges.neighbor_separation, ranges.obstacle_separation),
+        (weights.link_bonus, weights.separation_penalty, weights.obstacle_penalty, weights.epsilon, weights.beta),
+        np.inf if weights.max_distance is None else weights.max_distance,
+        weights.scale,
+    )
+    terms = dict(zip(_OWN_TERMS, own, strict=True))
     for name, weight in weights.extra_terms.items():
-        terms[name] = weight * EXTRA_TERMS[name](sensing, actions, ranges)
-    return {name: weights.scale * term for name, term in terms.items()}
+        terms[name] = weights.scale * (weight * EXTRA_TERMS[name](sensing, actions, ranges))
+    return terms
+
+
+def own_terms(
+    neighbor_observers: NDArray[np.int64],
+    neighbor_distances: NDArray[np.float64],
+    obstacle_observers: NDArray[np.int64],
+    obstacle_distances: NDArray[np.float64],
+    waypoint_distances: NDArray[np.float64],
+    actions: NDArray[np.float64],
+    separations: tuple[float, float],
+    weights: tuple[float, float, float, float, float],
+    max_distance: float,
+    scale: float,
+) -> NDArray[np.float64]:
+    """The paper's terms in the order of ``connectivity``, ``obstacle``, ``waypoint``, ``control`` (section IV-B).
+
+    :param neighbor_observers: :attr:`~sb3_flock.sim.sensing.Contacts.observers` of the neighbors, and so on
+    :param waypoint_distances: ``(flocks, vehicles)`` [m]
+    :param actions: ``(flocks, vehicles, 2)`` [m/s, rad/s]
+    :param separations: minimum separations to neighbors and to obstacles [m]
+    :param weights: ``link_bonus``, ``separation_penalty``, ``obstacle_penalty``, ``epsilon`` and ``beta``
+    :return: ``(4, flocks, vehicles)``
+    """
+
+    def count(observers: NDArray[np.int64]) -> NDArray[np.int64]:
+        counts: NDArray[np.int64] = np.bincount(observers, minlength=waypoint_distances.size)
+        return counts.reshape(waypoint_distances.shape)
+
+    link_bonus, separation_penalty, obstacle_penalty, epsilon, beta = weights
+    violations = count(neighbor_observers[neighbor_distances < separations[0]])
+    linked = count(neighbor_observers) - violations
+    return scale * np.stack(
+        (
+            link_bonus * linked - separation_penalty * violations,
+            -obstacle_penalty * count(obstacle_observers[obstacle_distances < separations[1]]),
+            -epsilon * np.minimum(waypoint_distances, max_distance),
+            beta * (np.square(actions[..., 0]) + np.square(actions[..., 1])),
+        )
+    )
 
 
 def own_reward(terms: dict[str, NDArray[np.float64]]) -> NDArray[np.float64]:

@@ -314,7 +314,8 @@ def waypoints_ahead(
     route, stride = settings.waypoint_route, settings.waypoint_speed * settings.time_step
     if route is not None:
         return along(np.array(route), stride * (steps + ahead))
-    distances = np.sqrt(np.square(waypoints).sum(-1, keepdims=True))
+    squares = np.square(waypoints)
+    distances = np.sqrt(squares[:, :1] + squares[:, 1:])
     return waypoints[:, None] * (1.0 - np.minimum(stride * ahead / np.maximum(distances, 1e-12), 1.0))[..., None]
 
 

@@ -66,15 +66,20 @@ def test_vehicle_steps(benchmark, peer_of_world, monkeypatch, n_flocks, kind):
     peer_of_world(benchmark, speed, "vmas", n_flocks, 5, 2)
 
 
-@pytest.mark.parametrize("n_vehicles", [10, 100, 1_000, 10_000, 100_000])
-def test_seconds_per_step_of_one_crowd(benchmark, peer_of_world, n_vehicles):
+def crowd(n_vehicles):
     """One world of constant density: four neighbors within range on average, an obstacle for ten vehicles."""
     side = np.sqrt(n_vehicles * np.pi * Scenario().link_range ** 2 / 4)
-    scenario = Scenario(
-        n_vehicles=n_vehicles, n_obstacles=n_vehicles // 10, arena=side / 2, neighbor_separation=0.0, obstacle_separation=0.0,
-        max_cycles=200,
+    return World(
+        Scenario(
+            n_vehicles=n_vehicles, n_obstacles=n_vehicles // 10, arena=side / 2, neighbor_separation=0.0,
+            obstacle_separation=0.0, max_cycles=200,
+        )
     )  # fmt: skip
-    world = World(scenario)
+
+
+@pytest.mark.parametrize("n_vehicles", [10, 100, 1_000, 10_000, 100_000])
+def test_seconds_per_step_of_one_crowd(benchmark, peer_of_world, n_vehicles):
+    world = crowd(n_vehicles)
     sensed = world.reset([episode_rng(0, 0)])
     rng = np.random.default_rng(0)
     actions = rng.uniform(world.action_low, world.action_high, (1, n_vehicles, 2))
@@ -90,6 +95,20 @@ def test_seconds_per_step_of_one_crowd(benchmark, peer_of_world, n_vehicles):
     if n_vehicles <= 100:  # VMAS needs more than four minutes to measure 1000
         for name in ("vmas", "mpe2"):
             peer_of_world(benchmark, n_vehicles / seconds, name, 1, n_vehicles, n_vehicles // 10)
+
+
+@pytest.mark.parametrize("n_vehicles", [1_000, 10_000])
+def test_seconds_per_step_of_one_crowd_and_its_policy(benchmark, n_vehicles):
+    """The world of a crowd and the policy that drives it."""
+    world, controller = crowd(n_vehicles), PolicyController(load_policy(POLICY))
+    start = world.reset([episode_rng(0, 0)])
+
+    def step(sensed):
+        return world.step(controller.act(sensed[-1], world.scenario))[:1]
+
+    benchmark.pedantic(step, ([start],), rounds=15, warmup_rounds=2)
+    if not benchmark.disabled:
+        benchmark.extra_info["seconds_per_step"] = benchmark.stats.stats.median
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sb3_flock.sim import Scenario, World, dynamics, episode_rng, mix_rewards, reward, sensing
+from sb3_flock.sim import Scenario, World, dynamics, episode_rng, mix_rewards, reward, reward_terms, sensing
 
 kernels = pytest.importorskip("sb3_flock.sim.kernels")
 
@@ -47,15 +47,16 @@ def test_bodies_move_as_in_numpy(seed, flocks, vehicles, obstacles):
         np.testing.assert_array_equal(fast, plain)
 
 
-def test_sensing_counting_and_mixing_are_those_of_numpy(monkeypatch):
+def test_sensing_and_rewards_are_those_of_numpy(monkeypatch):
     def sensed():
         world = World(Scenario(n_vehicles=9, n_obstacles=4, arena=0.3), 5)
         seen = world.reset([episode_rng(0, episode) for episode in range(5)])
         graph = seen.neighbors
         mixed = mix_rewards(np.arange(45.0).reshape(5, 9), graph.observers, graph.vehicles, 0.7)
+        terms = reward_terms(seen, np.full((5, 9, 2), 0.1), Scenario().reward, Scenario())
         counts = graph.count(), graph.count(0.12), seen.obstacles.count(0.2)
         contacts = [getattr(of, name) for of in (graph, seen.obstacles) for name in ("bodies", "positions", "distances")]
-        return [mixed, *counts, *contacts, seen.waypoint_positions, seen.waypoint_distances]
+        return [mixed, *terms.values(), *counts, *contacts, seen.waypoint_positions, seen.waypoint_distances]
 
     fast = sensed()
     for module in (sensing, reward):
