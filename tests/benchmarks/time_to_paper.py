@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import statistics
 import subprocess
 import sys
@@ -88,7 +89,10 @@ def main() -> None:
         for seed in options.seeds:
             changes = [f"--set={change}" for change in options.set]
             words = [sys.executable, __file__, *changes, "--one", *map(str, (*setup, seed))]
-            rows.append(json.loads(subprocess.run(words, check=True, stdout=subprocess.PIPE).stdout))
+            with tempfile.TemporaryDirectory() as cache:  # every process compiles the kernels itself
+                environment = {**os.environ, "NUMBA_CACHE_DIR": cache, "OMP_NUM_THREADS": "1"}
+                done = subprocess.run(words, check=True, stdout=subprocess.PIPE, env=environment)
+            rows.append(json.loads(done.stdout))
             print(json.dumps(rows[-1]), flush=True)
         minutes = [row["minutes"] or float("inf") for row in rows if (row["n_vehicles"], row["n_obstacles"]) == setup]
         print(f"{setup}: median {statistics.median(minutes):.1f} minutes of {len(minutes)} seeds", flush=True)
