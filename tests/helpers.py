@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import torch as th
+from gymnasium.utils.env_checker import data_equivalence
 from rich.console import Console
 
 from sb3_flock import FlockCNN, TrainingConfig, flocking_v0
@@ -105,3 +106,18 @@ DATA = Path(__file__).parent / "data"
 def expert_vec_env(scenario):
     """Two flocks whose expert is ORCA, queried in every step, as a vector env."""
     return flatten(ExpertEnv(scenario, lambda world: EXPERTS["orca"](world, None), 0.5, 0.1, queries=True), 2, seed=0)
+
+
+def assert_equal_rollouts(one, other, steps):
+    """Two vector envs return the same to the last bit, with the same random actions; the infos of each step are returned."""
+    rng, space, seen = np.random.default_rng(0), one.action_space, []
+    np.testing.assert_array_equal(one.reset(), other.reset())
+    for _ in range(steps):
+        actions = rng.uniform(space.low, space.high, (one.num_envs, 2)).astype(np.float32)
+        ours, theirs = one.step(actions), other.step(actions)
+        for mine, yours in zip(ours[:3], theirs[:3], strict=True):
+            np.testing.assert_array_equal(mine, yours)
+        assert [list(info) for info in ours[3]] == [list(info) for info in theirs[3]]
+        assert data_equivalence(ours[3], theirs[3], exact=True)
+        seen.append(theirs[3])
+    return seen

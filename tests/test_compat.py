@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from stable_baselines3.td3.policies import TD3Policy
 
 import sb3_flock
-from sb3_flock import Scenario, _compat, make_vec_env
+from sb3_flock import Scenario, _compat, flatten, flocking_v0, make_vec_env
 
 
 def pendulum(algorithm=DDPG, n_envs=1, **kwargs):
@@ -137,7 +137,7 @@ def test_episode_state_or_zips_would_grow_with_the_number_of_envs(tmp_path):
 
 
 def test_copies_in_process_or_get_attr_and_state_dict_would_miss_flocks():
-    env = make_vec_env(Scenario(n_vehicles=2), n_flocks=3, seed=0)
+    env = flatten(flocking_v0.parallel_env(Scenario(n_vehicles=2)), n_copies=3, seed=0)
     env.reset()
     copies = _compat.copies_in_process(env.venv)
     assert [copy.unwrapped.scenario.n_vehicles for copy in copies] == [2, 2, 2]

@@ -33,8 +33,9 @@ class Orca(Controller):
     """The velocity nearest to one towards the waypoint that collides with no sensed body over the time horizon.
 
     Every vehicle solves its own problem from what it senses: in RVO2's plane, the vehicle and the bodies in its range are
-    placed out of range of all other vehicles' problems. A vehicle's disc is half the minimum separation, an obstacle's the
-    rest of its own.
+    placed out of range of all other vehicles' problems. RVO2 computes in single precision, so that a place far from the origin
+    rounds its coordinates: each flock has a plane of its own, and its actions do not depend on the number of flocks.
+    A vehicle's disc is half the minimum separation, an obstacle's the rest of its own.
     ORCA does not keep links, and assumes holonomic discs: :func:`steer` turns its velocity into a unicycle's actions.
 
     :param gains: the default is the best of a search on separate episodes (``tests/benchmarks/tune_controllers.py``)
@@ -65,11 +66,12 @@ class Orca(Controller):
         sensing_range = 1.1 * max(
             scenario.link_range, scenario.detection_range
         )  # everything in range, whatever the rounding
-        simulator = self._new_simulator()  # a new one each step: pyrvo 0.4 keeps pointers to cleared agents
-        simulator.set_time_step(dt)
-        groups = _Groups(simulator, 5 * sensing_range, len(preferred))
+        flocks, vehicles, _ = sensing.waypoint_positions.shape
+        planes = [_Groups(self._new_simulator(), dt, 5 * sensing_range, vehicles) for _ in range(flocks)]
         for i, (velocity, preferred_velocity) in enumerate(zip(velocities.tolist(), preferred.tolist(), strict=True)):
-            groups.add(i, (0.0, 0.0), velocity, preferred_velocity, own_radius, sensing_range, gains.time_horizon, speed)
+            planes[i // vehicles].add(
+                i % vehicles, (0.0, 0.0), velocity, preferred_velocity, own_radius, sensing_range, gains.time_horizon, speed
+            )
         for contacts, memory, n_bodies, radius in (
             (sensing.neighbors, self._neighbors, scenario.n_vehicles, own_radius),
             (sensing.obstacles, self._obstacles, scenario.n_obstacles, obstacle_radius),
@@ -77,9 +79,10 @@ class Orca(Controller):
             theirs = memory.update(contacts, n_bodies, sensing.ego_motion, dt)
             rows = zip(contacts.observers.tolist(), contacts.positions.tolist(), theirs.tolist(), strict=True)
             for observer, position, velocity in rows:
-                groups.add(observer, position, velocity, velocity, radius, 0.0, gains.time_horizon, speed)
-        simulator.do_step()
-        chosen = np.array([groups.velocity(i) for i in range(len(preferred))]).reshape(sensing.waypoint_positions.shape)
+                planes[observer // vehicles].add(
+                    observer % vehicles, position, velocity, velocity, radius, 0.0, gains.time_horizon, speed
+                )
+        chosen = np.array([plane.velocities() for plane in planes]).reshape(sensing.waypoint_positions.shape)
         return steer(chosen, scenario)
 
     def state_dict(self) -> dict[str, Any]:
@@ -92,10 +95,14 @@ class Orca(Controller):
 
 
 class _Groups:
-    """Groups of RVO2 agents around centers so far apart that no agent of one group is in range of another group."""
+    """Groups of RVO2 agents around centers so far apart that no agent of one group is in range of another group.
 
-    def __init__(self, simulator: Any, gap: float, count: int) -> None:
-        self.simulator, self.gap = simulator, gap
+    :param simulator: a new one for each step: pyrvo 0.4 keeps pointers to cleared agents
+    """
+
+    def __init__(self, simulator: Any, time_step: float, gap: float, count: int) -> None:
+        self.simulator, self.gap, self.count = simulator, gap, count
+        self.simulator.set_time_step(time_step)
         self.columns = max(1, int(np.ceil(np.sqrt(count))))
 
     def add(
@@ -114,9 +121,11 @@ class _Groups:
         agent = self.simulator.add_agent(place, sensing_range, _MAX_NEIGHBORS, horizon, horizon, radius, speed, velocity)
         self.simulator.set_agent_pref_velocity(agent, preferred_velocity)
 
-    def velocity(self, agent: int) -> tuple[float, float]:
-        vector = self.simulator.get_agent_velocity(agent)
-        return vector.x, vector.y
+    def velocities(self) -> list[tuple[float, float]]:
+        """The velocity after one step of the agent that was added first to each group."""
+        self.simulator.do_step()
+        vectors = (self.simulator.get_agent_velocity(agent) for agent in range(self.count))
+        return [(vector.x, vector.y) for vector in vectors]
 
 
 _MAX_NEIGHBORS = 20

@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.random import Generator
 from numpy.typing import NDArray
 
 from sb3_flock.controllers import Controller
+from sb3_flock.envs.batch import copy_flocks, select_flocks
 from sb3_flock.envs.flocking_v0 import Action, Observation, parallel_env
 from sb3_flock.sim import Scenario, Sensing, World
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 
 class ExpertEnv(parallel_env):
     """:class:`~sb3_flock.envs.flocking_v0.parallel_env` with an expert, as in DAgger's interactive collection.
 
     The expert drives a share of the episodes. In those the actions given to :meth:`step` are not executed. Which episodes the
-    expert drives, and the noise on its actions, are drawn from the env's own random stream. The infos of a step also hold:
+    expert drives, and the noise on its actions, are drawn from each flock's own random stream. The infos of a step also hold:
 
     * ``expert_drives``: whether the expert drives this episode;
     * ``executed_action``: in its episodes, the executed action ``(2,)`` [m/s, rad/s], unfiltered, which
@@ -26,10 +29,11 @@ class ExpertEnv(parallel_env):
     * ``expert_action``: with ``queries``, what the expert would do, ``(2,)`` [m/s, rad/s], in every episode.
 
     :param scenario: the task
-    :param make_expert: makes the expert; it is given the world, which an expert may see whole
+    :param make_expert: makes the expert; it is given a world of the flocks that it acts for, which an expert may see whole
     :param fraction: probability that the expert drives an episode, in [0, 1] (DAgger's beta)
     :param noise_std: standard deviation of the noise on the expert's executed actions [half the action range]
-    :param queries: put ``expert_action`` into every info
+    :param queries: put ``expert_action`` into every info; otherwise the expert acts only for the flocks that it drives
+    :param n_flocks: number of independent flocks
     """
 
     def __init__(
@@ -39,38 +43,59 @@ class ExpertEnv(parallel_env):
         fraction: float,
         noise_std: float,
         queries: bool = False,
+        n_flocks: int = 1,
     ) -> None:
-        super().__init__(scenario)
-        self.expert, self.fraction, self.noise_std, self.queries = make_expert(self.world), fraction, noise_std, queries
+        super().__init__(scenario, n_flocks=n_flocks)
+        acts_for_all = queries or n_flocks == 1
+        self._seen = self.world if acts_for_all else World(scenario)
+        self.expert, self.fraction, self.noise_std, self.queries = make_expert(self._seen), fraction, noise_std, queries
+        self._drives = np.zeros(n_flocks, bool)
         self._expert_actions: NDArray[np.floating] | None = None
         self._next_actions: NDArray[np.float64] | None = None
 
     @property
     def expert_drives(self) -> bool:
-        """Whether the expert drives the current episode."""
-        return self._next_actions is not None
+        """Whether the expert drives the current episode; with several flocks, that of any of them."""
+        return bool(self._drives.any())
 
     def step(
         self, actions: dict[str, Action]
     ) -> tuple[dict[str, Observation], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
         """Move everything by one sampling period, by the expert's actions in its episodes."""
+        drives = np.repeat(self._drives, self.scenario.n_vehicles)
         queried, executed = self._expert_actions if self.queries else None, self._next_actions
-        if executed is not None:
-            actions = dict(zip(self.possible_agents, executed, strict=True))
         result = super().step(actions)
-        for info in result[-1].values():
-            info["expert_drives"] = executed is not None
-        for name, by_agent in (("executed_action", executed), ("expert_action", queried)):
-            if by_agent is not None:
-                for info, action in zip(result[-1].values(), by_agent, strict=True):
-                    info[name] = action
+        infos = list(result[-1].values())
+        for info, driven in zip(infos, drives.tolist(), strict=True):
+            info["expert_drives"] = driven
+        if executed is not None:
+            for slot, action in zip(np.flatnonzero(drives).tolist(), executed.reshape(-1, 2), strict=True):
+                infos[slot]["executed_action"] = action
+        if queried is not None:
+            for info, expert_action in zip(infos, queried.reshape(-1, 2), strict=True):
+                info["expert_action"] = expert_action
         return result
 
+    def commands(self, actions: Mapping[str, Action]) -> NDArray[np.float64]:
+        """The actions for the world, ``(flocks, vehicles, 2)`` [m/s, rad/s]: the expert's in its episodes."""
+        commands = super().commands(actions)
+        if self._next_actions is not None:
+            commands[self._drives] = self._next_actions
+        return commands
+
+    def copy_at(self, index: int) -> Self:
+        """The env of one flock alone, to look at its present state; the expert is that of all flocks."""
+        one = super().copy_at(index)
+        if one is not self:
+            one._drives = self._drives[index : index + 1]
+        return one
+
     def state_dict(self) -> dict[str, Any]:
-        """The current episode and the random stream and, where the expert acts, its memory and its next actions."""
+        """The current episodes and the random streams and, where the expert acts, its memory and its next actions."""
         expert = None
         if self._expert_actions is not None:
             expert = {
+                "drives": self._drives,
                 "expert_actions": self._expert_actions,
                 "next_actions": self._next_actions,
                 "memory": self.expert.state_dict(),
@@ -78,28 +103,38 @@ class ExpertEnv(parallel_env):
         return {**super().state_dict(), "expert": expert}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore the episode of :meth:`state_dict`."""
+        """Restore the episodes of :meth:`state_dict`."""
         super().load_state_dict(state)
+        self._drives = np.zeros(self.n_copies, bool)
         self._expert_actions = self._next_actions = None
         if state["expert"] is not None:
+            self._drives = np.array(state["expert"]["drives"])
             self._expert_actions, self._next_actions = state["expert"]["expert_actions"], state["expert"]["next_actions"]
             self.expert.load_state_dict(state["expert"]["memory"])
 
     def measure(self, sensing: Sensing) -> Sensing:
         """What the vehicles measure, once a step; the expert decides on its next actions from the same measurement."""
-        assert self.rng is not None
         measured = super().measure(sensing)
-        if self.world.steps == 0:
-            expert_drives = self.rng.random() < self.fraction
-            self.expert.reset([self.rng], self.scenario)
-        else:
-            expert_drives = self.expert_drives
+        is_start = self.world.steps == 0
+        if is_start:
+            self._drives = np.array([rng.random() < self.fraction for rng in self.rngs])
         self._expert_actions = self._next_actions = None
-        if expert_drives or self.queries:
-            self._expert_actions = self.expert.act(measured, self.scenario)[0]
-            self._next_actions = self._noisy(self._expert_actions, self.rng) if expert_drives else None
+        flocks = np.arange(self.n_copies) if self.queries else np.flatnonzero(self._drives)
+        if is_start:
+            self.expert.reset([self.rngs[flock] for flock in flocks], self.scenario)
+        if len(flocks):
+            seen = measured if len(flocks) == self.n_copies else select_flocks(measured, flocks)
+            if self._seen is not self.world:
+                copy_flocks(self.world, flocks, self._seen)
+            self._expert_actions = self.expert.act(seen, self.scenario)
+        if self._drives.any():
+            assert self._expert_actions is not None
+            self._next_actions = self._noisy(self._expert_actions[self._drives] if self.queries else self._expert_actions)
         return measured
 
-    def _noisy(self, actions: NDArray[np.floating], rng: Generator) -> NDArray[np.float64]:
+    def _noisy(self, actions: NDArray[np.floating]) -> NDArray[np.float64]:
+        """The actions for the flocks that the expert drives, each with noise from the flock's own stream."""
         low, high = self.world.action_low, self.world.action_high
-        return np.clip(actions + self.noise_std * (high - low) / 2 * rng.normal(size=actions.shape), low, high)
+        driven = (rng for rng, drives in zip(self.rngs, self._drives, strict=True) if drives)
+        noise = np.stack([rng.normal(size=actions.shape[1:]) for rng in driven])
+        return np.clip(actions + self.noise_std * (high - low) / 2 * noise, low, high)

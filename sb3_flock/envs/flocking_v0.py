@@ -30,12 +30,17 @@ distance to the waypoint and ``control`` large actions.
 
 **Arguments.** Any field of :class:`sb3_flock.Scenario` by name (``n_vehicles``, ``n_obstacles``, ``max_cycles``, ...), or a
 ready ``scenario``, and ``render_mode``.
+
+**Several flocks.** With ``n_flocks`` the env holds independent copies of the task, simulated in one batch: the agents
+``flock_0/vehicle_0``, ``flock_0/vehicle_1``, ..., ``flock_1/vehicle_0``, ... In the infos, ``neighbors`` are indices into the
+agents of the same flock.
 """
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from gymnasium import spaces
@@ -44,10 +49,14 @@ from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils import wrappers
 from pettingzoo.utils.conversions import parallel_to_aec
 
-from sb3_flock.settings import SettingsError
+from sb3_flock.envs.batch import copy_flocks
+from sb3_flock.settings import SettingsError, check_integer
 from sb3_flock.sim import Scenario, Sensing, World, observe, own_reward, reward_terms
 from sb3_flock.sim.dynamics import MAX_BODIES
 from sb3_flock.sim.sensing import is_connected, nearest
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 Observation = NDArray[np.float32]
 Action = NDArray[np.float32]
@@ -77,12 +86,16 @@ def action_space(scenario: Scenario) -> spaces.Box:
 
 
 class parallel_env(ParallelEnv[str, Observation, Action]):  # noqa: N801 - PettingZoo's name for it
-    """The flocking task as a PettingZoo ``ParallelEnv``: a :class:`~sb3_flock.sim.World` of one flock.
+    """The flocking task as a PettingZoo ``ParallelEnv``: a :class:`~sb3_flock.sim.World` of one flock, or of several.
 
     :param scenario: the task; fields given by name change it
-    :param render_mode: ``None``, ``"human"`` or ``"rgb_array"``
+    :param render_mode: ``None``, ``"human"`` or ``"rgb_array"``; the first flock is drawn
+    :param n_flocks: number of independent flocks
     :param fields: fields of :class:`~sb3_flock.Scenario` by name
     :raises SettingsError: for an unknown field, a value that is not accepted or an unknown render mode
+
+    :ivar n_copies: number of flocks; the agents are those of the first, then those of the second, ...
+    :ivar rngs: each flock's random stream; empty before the first reset
     """
 
     metadata: ClassVar[dict[str, Any]] = {
@@ -92,54 +105,62 @@ class parallel_env(ParallelEnv[str, Observation, Action]):  # noqa: N801 - Petti
         "render_fps": 10,
     }
 
-    def __init__(self, scenario: Scenario | None = None, render_mode: str | None = None, **fields: Any) -> None:
+    def __init__(
+        self, scenario: Scenario | None = None, render_mode: str | None = None, n_flocks: int = 1, **fields: Any
+    ) -> None:
+        check_integer("n_flocks", n_flocks, least=1)
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise SettingsError(f"render_mode = {render_mode!r}: one of {self.metadata['render_modes']} or None is needed")
         self.scenario = (scenario or Scenario()).replace(**fields)
         self.render_mode = render_mode
-        self.possible_agents = [f"vehicle_{i}" for i in range(self.scenario.n_vehicles)]
+        self.n_copies = n_flocks
+        vehicles = [f"vehicle_{i}" for i in range(self.scenario.n_vehicles)]
+        self.possible_agents = (
+            vehicles if n_flocks == 1 else [f"flock_{flock}/{name}" for flock in range(n_flocks) for name in vehicles]
+        )
         self.agents: list[str] = []
-        self._observation_spaces = {agent: observation_space(self.scenario) for agent in self.possible_agents}
-        self._action_spaces = {agent: action_space(self.scenario) for agent in self.possible_agents}
-        self.world = World(self.scenario, n_flocks=1)
-        self.rng: np.random.Generator | None = None
+        self._observation_spaces = {name: observation_space(self.scenario) for name in vehicles}
+        self._action_spaces = {name: action_space(self.scenario) for name in vehicles}
+        self.world = World(self.scenario, n_flocks)
+        self.rngs: list[np.random.Generator] = []
+        self._copies: dict[int, Self] = {}
         self._renderer: Any = None
 
     def observation_space(self, agent: str) -> spaces.Box:
         """The observation space of an agent; the same object at every call."""
-        return self._observation_spaces[agent]
+        return self._observation_spaces[agent.rpartition("/")[2]]
 
     def action_space(self, agent: str) -> spaces.Box:
         """The action space of an agent; the same object at every call."""
-        return self._action_spaces[agent]
+        return self._action_spaces[agent.rpartition("/")[2]]
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Observation], dict[str, dict[str, Any]]]:
         """Start an episode.
 
-        :param seed: seeds this env's random stream; without one the stream continues (the first reset draws a fresh one)
+        :param seed: seeds flock i's random stream with ``seed + i``; without one the streams continue (the first reset draws
+            fresh ones)
         :param options: ignored
         :return: observations and empty infos by agent
         """
-        if seed is not None or self.rng is None:
-            self.rng = np.random.default_rng(seed)
+        if seed is not None or not self.rngs:
+            self.rngs = [np.random.default_rng(None if seed is None else seed + i) for i in range(self.n_copies)]
         self.agents = list(self.possible_agents)
-        sensing = self.world.reset([self.rng])
+        sensing = self.world.reset(self.rngs)
         return self._observations(sensing), {agent: {} for agent in self.agents}
 
     def step(
         self, actions: dict[str, Action]
     ) -> tuple[dict[str, Observation], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
         """Move everything by one sampling period; see the module's page for what comes back."""
-        sensing, executed = self.world.step([[actions[agent] for agent in self.agents]])
-        by_name = reward_terms(sensing, executed, self.scenario.reward, self.scenario)
-        terms = {name: term[0] for name, term in by_name.items()}
+        sensing, executed = self.world.step(self.commands(actions))
+        terms = reward_terms(sensing, executed, self.scenario.reward, self.scenario)
         truncated = self.world.steps >= self.scenario.max_cycles
         infos = self._infos(sensing, terms, truncated)
         result = (
             self._observations(sensing),
-            dict(zip(self.agents, own_reward(terms).tolist(), strict=True)),
+            dict(zip(self.agents, own_reward(terms).ravel().tolist(), strict=True)),
             dict.fromkeys(self.agents, False),
             dict.fromkeys(self.agents, truncated),
             infos,
@@ -161,22 +182,41 @@ class parallel_env(ParallelEnv[str, Observation, Action]):  # noqa: N801 - Petti
             from sb3_flock.envs.rendering import Renderer
 
             self._renderer = Renderer(self.scenario, self.render_mode, self.metadata["render_fps"])
-        return self._renderer.draw(self.world)
+        return self._renderer.draw(self.copy_at(0).world)
 
     def state(self) -> NDArray[np.float32]:
-        """All vehicles' observations stacked, ``(vehicles, channels, l, l)``, without sensor errors and memory."""
-        return observe(self.world.sense(), self.scenario)[0]
+        """All agents' observations stacked, ``(agents, channels, l, l)``, without sensor errors and memory."""
+        return observe(self.world.sense(), self.scenario).reshape(-1, *self.scenario.observation_shape)
+
+    def copy_at(self, index: int) -> Self:
+        """The env of one flock alone, to look at its present state; the env itself if there is one flock."""
+        if self.n_copies == 1:
+            return self
+        one = self._copies.get(index)
+        if one is None:
+            one = self._copies[index] = copy.copy(self)
+            one.n_copies, one.world, one._renderer = 1, World(self.scenario), None
+            one.possible_agents = list(self._action_spaces)
+        one.rngs, one.agents = self.rngs[index : index + 1], list(one.possible_agents) if self.agents else []
+        if self.rngs:
+            copy_flocks(self.world, slice(index, index + 1), one.world)
+        return one
 
     def state_dict(self) -> dict[str, Any]:
-        """The current episode and the random stream: plain values and arrays."""
-        rng = None if self.rng is None else self.rng.bit_generator.state
-        return {"world": self.world.state_dict() if self.agents else None, "rng": rng}
+        """The current episodes and the random streams: plain values and arrays."""
+        rngs = [rng.bit_generator.state for rng in self.rngs]
+        return {"world": self.world.state_dict() if self.agents else None, "rngs": rngs}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore the episode of :meth:`state_dict`; what follows is equal to the last bit."""
-        if state["rng"] is not None:
-            self.rng = np.random.default_rng()
-            self.rng.bit_generator.state = state["rng"]
+        """Restore the episodes of :meth:`state_dict`; what follows is equal to the last bit.
+
+        :raises ValueError: for another number of flocks
+        """
+        if len(state["rngs"]) not in (0, self.n_copies):
+            raise ValueError(f"the state is of {len(state['rngs'])} flocks: {self.n_copies} are needed")
+        self.rngs = [np.random.default_rng() for _ in state["rngs"]]
+        for rng, saved in zip(self.rngs, state["rngs"], strict=True):
+            rng.bit_generator.state = saved
         self.agents = []
         if state["world"] is not None:
             self.world.load_state_dict(state["world"])
@@ -189,33 +229,39 @@ class parallel_env(ParallelEnv[str, Observation, Action]):  # noqa: N801 - Petti
             self._renderer = None
 
     def _observations(self, sensing: Sensing) -> dict[str, Observation]:
-        return dict(zip(self.possible_agents, observe(self.measure(sensing), self.scenario)[0], strict=True))
+        observations = observe(self.measure(sensing), self.scenario)
+        return dict(zip(self.possible_agents, observations.reshape(-1, *observations.shape[2:]), strict=True))
 
     def measure(self, sensing: Sensing) -> Sensing:
         """What the vehicles measure of what there is; the env calls it once a step, before it returns the observations."""
         return self.world.sensors.measure(sensing)
 
+    def commands(self, actions: Mapping[str, Action]) -> NDArray[np.float64]:
+        """The actions for the world, ``(flocks, vehicles, 2)`` [m/s, rad/s]; the env calls it once a step."""
+        given = np.array([actions[agent] for agent in self.agents], dtype=np.float64)
+        return given.reshape(-1, self.scenario.n_vehicles, 2)
+
     def _infos(self, sensing: Sensing, terms: dict[str, NDArray[np.float64]], truncated: bool) -> dict[str, dict[str, Any]]:
-        scenario = self.scenario
-        positions = self.world.positions
-        nearest_neighbor = nearest(positions, positions, exclude_self=True)[0]
-        nearest_obstacle = nearest(positions, self.world.obstacle_positions)[0]
-        neighbors = sensing.neighbors.by_observer()
-        connected = bool(is_connected(sensing.neighbors)[0])
-        infos: dict[str, dict[str, Any]] = {}
-        for i, agent in enumerate(self.agents):
-            infos[agent] = {
-                "neighbors": neighbors[i],
-                "reward_terms": {name: float(term[i]) for name, term in terms.items()},
-                "metrics": {
-                    "tracking_error": float(sensing.waypoint_distances[0, i]),
-                    "nearest_neighbor": float(nearest_neighbor[i]),
-                    "nearest_obstacle": float(nearest_obstacle[i]),
-                    "neighbor_violation": bool(nearest_neighbor[i] < scenario.neighbor_separation),
-                    "obstacle_violation": bool(nearest_obstacle[i] < scenario.obstacle_separation),
-                    "connected": connected,
-                },
-            }
-            if truncated:
-                infos[agent]["TimeLimit.truncated"] = True
-        return infos
+        scenario, positions = self.scenario, self.world.positions
+        nearest_neighbor = nearest(positions, positions, exclude_self=True)
+        nearest_obstacle = nearest(positions, self.world.obstacle_positions)
+        metrics = {
+            "tracking_error": sensing.waypoint_distances,
+            "nearest_neighbor": nearest_neighbor,
+            "nearest_obstacle": nearest_obstacle,
+            "neighbor_violation": nearest_neighbor < scenario.neighbor_separation,
+            "obstacle_violation": nearest_obstacle < scenario.obstacle_separation,
+            "connected": np.repeat(is_connected(sensing.neighbors), scenario.n_vehicles),
+        }
+        by_agent = zip(sensing.neighbors.by_observer(), _rows(terms), _rows(metrics), strict=True)
+        end = {"TimeLimit.truncated": True} if truncated else {}
+        return {
+            agent: {"neighbors": neighbors, "reward_terms": own_terms, "metrics": own_metrics, **end}
+            for agent, (neighbors, own_terms, own_metrics) in zip(self.agents, by_agent, strict=True)
+        }
+
+
+def _rows(columns: Mapping[str, NDArray[Any]]) -> list[dict[str, Any]]:
+    """Arrays of one value an agent as one dict of Python numbers an agent."""
+    rows = zip(*(column.ravel().tolist() for column in columns.values()), strict=True)
+    return [dict(zip(columns, row, strict=True)) for row in rows]

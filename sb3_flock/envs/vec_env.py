@@ -2,13 +2,17 @@
 
 Every agent of every copy becomes one slot of the vector env, copy by copy: slot ``copy * n_agents + i`` is the copy's agent
 ``possible_agents[i]``, and its action goes to that agent alone. One policy serves all slots: that is parameter sharing.
+
+This package's own flocks are copies within one env, which simulates them in one batch: stepping 32 envs of one flock each takes
+several times as long.
 """
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from multiprocessing.connection import wait
 from typing import Any
 
@@ -18,12 +22,14 @@ from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 from supersuit.vector.concat_vec_env import ConcatVecEnv
+from supersuit.vector.markov_vector_wrapper import MarkovVectorEnv
 from supersuit.vector.multiproc_vec import ProcConcatVec
 from supersuit.vector.sb3_vector_wrapper import SB3VecEnvWrapper
 
 from sb3_flock._compat import copies_in_process, is_multiprocess, reset_workers
 from sb3_flock.envs import flocking_v0
-from sb3_flock.settings import RunError, check_integer
+from sb3_flock.envs.multi_flock import MultiFlockEnv
+from sb3_flock.settings import RunError, SettingsError, check_integer
 from sb3_flock.sim import Scenario
 
 
@@ -44,7 +50,40 @@ def make_vec_env(
     :raises SettingsError: for a count that is not accepted
     """
     check_integer("n_flocks", n_flocks, least=1)
-    return flatten(flocking_v0.parallel_env(scenario, render_mode=render_mode), n_flocks, num_cpus, seed)
+    return flatten_batch(lambda count: flocking_v0.parallel_env(scenario, render_mode, count), n_flocks, num_cpus, seed)
+
+
+def flatten_batch(
+    make_env: Callable[[int], flocking_v0.parallel_env | MultiFlockEnv],
+    n_copies: int,
+    num_cpus: int = 0,
+    seed: int | None = None,
+) -> ParameterSharingVecEnv:
+    """Flocks of this package's envs flattened into one SB3 vector env; each process simulates its own in one batch.
+
+    :param make_env: makes an env of a number of copies
+    :param n_copies: number of independent copies
+    :param num_cpus: worker processes; 0 and 1 keep everything in this process
+    :param seed: seeds all copies, each with a stream of its own, whatever ``num_cpus``
+    :raises SettingsError: for a count that is not accepted
+    """
+    check_integer("num_cpus", num_cpus, least=0)
+    share = -(-n_copies // max(num_cpus, 1))
+    if share == n_copies:
+        return flatten(make_env(n_copies), seed=seed)
+    example = supersuit.pettingzoo_env_to_vec_env_v1(make_env(1))
+    workers = [
+        partial(_flat, make_env, min(share, n_copies - first)) for first in range(0, n_copies, share)
+    ]  # the last one may have fewer copies, which SuperSuit's own constructor does not provide for
+    slots = n_copies * example.num_envs
+    vec_env = ProcConcatVec(workers, example.observation_space, example.action_space, slots, example.metadata)
+    adapter = ParameterSharingVecEnv(vec_env, example.par_env)
+    adapter.seed(seed)
+    return adapter
+
+
+def _flat(make_env: Callable[[int], ParallelEnv], n_copies: int) -> MarkovVectorEnv:
+    return supersuit.pettingzoo_env_to_vec_env_v1(make_env(n_copies))
 
 
 def flatten(env: ParallelEnv, n_copies: int = 1, num_cpus: int = 0, seed: int | None = None) -> ParameterSharingVecEnv:
@@ -58,6 +97,8 @@ def flatten(env: ParallelEnv, n_copies: int = 1, num_cpus: int = 0, seed: int | 
     """
     check_integer("n_copies", n_copies, least=1)
     check_integer("num_cpus", num_cpus, least=0)
+    if n_copies > 1 and getattr(env.unwrapped, "n_copies", 1) > 1:
+        raise SettingsError(f"n_copies = {n_copies}: 1 is needed for an env that holds several copies itself")
     flat = supersuit.pettingzoo_env_to_vec_env_v1(env)
     vec_env = supersuit.concat_vec_envs_v1(flat, n_copies, num_cpus=num_cpus, base_class="gymnasium")
     adapter = ParameterSharingVecEnv(vec_env, env)
@@ -72,11 +113,15 @@ class ParameterSharingVecEnv(SB3VecEnvWrapper):
     wherever an episode is cut and not ended; boolean ``dones``; SB3's ``get_attr``, ``set_attr`` and ``env_method`` (without
     workers); ``render_mode`` through wrappers and workers; one clear error when a worker dies, and workers that close.
 
+    Where one env simulates several copies in a batch, ``get_attr`` and ``env_method`` show each copy alone
+    (:meth:`~sb3_flock.envs.flocking_v0.parallel_env.copy_at`); what they change in it has no effect on the batch.
+
     :ivar n_agents: agents of one copy; slot ``s`` is agent ``s % n_agents`` of copy ``s // n_agents``
     """
 
     def __init__(self, venv: ConcatVecEnv | ProcConcatVec, example: ParallelEnv) -> None:
-        self.n_agents = len(example.possible_agents)
+        self._copies_per_env = getattr(example.unwrapped, "n_copies", 1)
+        self.n_agents = len(example.possible_agents) // self._copies_per_env
         if is_multiprocess(venv):
             venv.render_mode = example.unwrapped.render_mode
         super().__init__(venv)
@@ -179,14 +224,14 @@ class ParameterSharingVecEnv(SB3VecEnvWrapper):
     # -- state --------------------------------------------------------------------------------------------------------
 
     def state_dict(self) -> list[dict[str, Any]] | None:
-        """The current episodes and the random streams of every copy, or ``None`` where workers hold them."""
+        """The current episodes and the random streams of every env, or ``None`` where workers hold them."""
         if self._has_workers:
             return None
-        return [env.unwrapped.state_dict() for env in self._copies(range(0, self.num_envs, self.n_agents))]
+        return [env.unwrapped.state_dict() for env in copies_in_process(self.venv)]
 
     def load_state_dict(self, state: Sequence[Mapping[str, Any]]) -> None:
         """Restore the episodes of :meth:`state_dict`; the next reset continues their random streams."""
-        for env, saved in zip(self._copies(range(0, self.num_envs, self.n_agents)), state, strict=True):
+        for env, saved in zip(copies_in_process(self.venv), state, strict=True):
             env.unwrapped.load_state_dict(saved)
         self._seed, self._unseeded = None, False
 
@@ -239,6 +284,11 @@ class ParameterSharingVecEnv(SB3VecEnvWrapper):
     def _copies(self, indices: Any) -> Iterable[ParallelEnv]:
         if self._has_workers:
             raise NotImplementedError("SuperSuit's workers give no access to their envs: use num_cpus=0")
-        copies = copies_in_process(self.venv)
+        envs = copies_in_process(self.venv)
+        copies: dict[int, ParallelEnv] = {}
         for slot in self._get_indices(indices):
-            yield copies[slot // self.n_agents]
+            number = slot // self.n_agents
+            if number not in copies:
+                env, index = divmod(number, self._copies_per_env)
+                copies[number] = envs[env] if self._copies_per_env == 1 else envs[env].unwrapped.copy_at(index)
+            yield copies[number]

@@ -8,8 +8,10 @@ The module is importable without torch.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
+
+import numpy as np
 
 from sb3_flock._renamed import rename_fields
 from sb3_flock.settings import Settings, SettingsError, format_value, group_of
@@ -118,12 +120,71 @@ _STATE_KEYS = {
 
 def migrate_state(state: Any, number: int) -> Any:
     """The state of a training in a checkpoint, in the present format."""
-    if number >= 3:
-        return state
+    current = state if number >= 3 else _rename_state(state)
+    model = current.get("model", {})
+    if _is_of_one_flock(model.get("env")):
+        current = {**current, "model": {**model, "env": [_join_flocks(model["env"])]}}
+    return current
+
+
+def _rename_state(state: Any) -> Any:
     if isinstance(state, Mapping):
-        current = {_STATE_KEYS.get(key, key): migrate_state(value, number) for key, value in state.items()}
+        current = {_STATE_KEYS.get(key, key): _rename_state(value) for key, value in state.items()}
         if "expert" in current and isinstance(current["expert"], dict):
             # The first files with an expert did not store its action apart from the noisy one.
             current["expert"].setdefault("expert_actions", current["expert"].get("next_actions"))
         return current
-    return [migrate_state(value, number) for value in state] if isinstance(state, list) else state
+    return [_rename_state(value) for value in state] if isinstance(state, list) else state
+
+
+def _is_of_one_flock(env: Any) -> bool:
+    """Whether an env's state is a list of states of one flock each: the first checkpoints kept every flock's own env."""
+    first = env[0] if isinstance(env, list) and env else {}
+    return "rng" in (first["flocks"][0] if "flocks" in first else first)
+
+
+def _join_flocks(flocks: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The state of an env with all flocks, from those of envs with one flock each."""
+    if "flocks" in flocks[0]:  # several sizes: every state has one flock of each
+        return {
+            "flocks": [_join_flocks(same_size) for same_size in zip(*(state["flocks"] for state in flocks), strict=True)]
+        }
+    world = _join([state["world"] for state in flocks])
+    joined = {"world": world, "rngs": [state["rng"] for state in flocks]}
+    if "expert" not in flocks[0]:
+        return joined
+    acting = [state["expert"] for state in flocks if state["expert"] is not None]
+    if not acting:
+        return {**joined, "expert": None}
+    driven = [expert["next_actions"] for expert in acting if expert["next_actions"] is not None]
+    expert = {
+        "drives": np.array([bool(state["expert"]) and state["expert"]["next_actions"] is not None for state in flocks]),
+        "expert_actions": np.stack([expert["expert_actions"] for expert in acting]),
+        "next_actions": np.stack(driven) if driven else None,
+        "memory": _join([expert["memory"] for expert in acting]),
+    }
+    vehicles = world["positions"].shape[1]
+    for name, bodies in (("neighbors", vehicles), ("obstacles", world["obstacle_positions"].shape[1])):
+        if name in expert["memory"]:  # numbers of the pairs of a vehicle and a body, counted through all flocks
+            keys = [expert["memory"][name]["keys"] + flock * vehicles * bodies for flock, expert in enumerate(acting)]
+            expert["memory"][name]["keys"] = np.concatenate(keys)
+    return {**joined, "expert": expert}
+
+
+def _join(parts: Sequence[Any], name: str = "") -> Any:
+    """States of one flock each as one: arrays along the axis of the flocks, what is the same for all of them once."""
+    first = parts[0]
+    if name == "rngs":
+        return [rng for part in parts for rng in part]
+    if isinstance(first, list):
+        return [_join(items) for items in zip(*parts, strict=True)]
+    if isinstance(first, np.ndarray):
+        return np.concatenate(parts, axis=1 if name in ("obstacle_speeds", "obstacle_turn_rates") else 0)
+    if not isinstance(first, Mapping):
+        return first
+    joined = {key: _join([part[key] for part in parts], key) for key in first}
+    if "observers" in first:  # contacts
+        vehicles = first["shape"][1]
+        joined["observers"] = np.concatenate([part["observers"] + flock * vehicles for flock, part in enumerate(parts)])
+        joined["shape"] = [len(parts), vehicles]
+    return joined

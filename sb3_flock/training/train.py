@@ -20,7 +20,7 @@ from sb3_flock.controllers import EXPERTS
 from sb3_flock.envs.expert_env import ExpertEnv
 from sb3_flock.envs.flocking_v0 import parallel_env
 from sb3_flock.envs.multi_flock import MultiFlockEnv
-from sb3_flock.envs.vec_env import ParameterSharingVecEnv, flatten
+from sb3_flock.envs.vec_env import ParameterSharingVecEnv, flatten_batch
 from sb3_flock.rl.callbacks import (
     FlockMetrics,
     LinearNoiseDecay,
@@ -183,15 +183,18 @@ def _prepare(config: TrainingConfig) -> tuple[OffPolicyAlgorithm, VecEnv]:
 
 def make_training_env(config: TrainingConfig) -> ParameterSharingVecEnv:
     """The flattened training env, with an expert where ``train_env`` names one."""
-    flocks = [_make_flock(config, scenario) for scenario in config.training_scenarios()]
-    env = flocks[0] if len(flocks) == 1 else MultiFlockEnv(flocks)
-    return flatten(env, config.n_flocks, config.num_cpus, config.seed)
+
+    def make_env(n_flocks: int) -> parallel_env | MultiFlockEnv:
+        flocks = [_make_flocks(config, scenario, n_flocks) for scenario in config.training_scenarios()]
+        return flocks[0] if len(flocks) == 1 else MultiFlockEnv(flocks)
+
+    return flatten_batch(make_env, config.n_flocks, config.num_cpus, config.seed)
 
 
-def _make_flock(config: TrainingConfig, scenario: Scenario) -> parallel_env:
+def _make_flocks(config: TrainingConfig, scenario: Scenario, n_flocks: int) -> parallel_env:
     train_env = config.train_env
     if train_env.expert is None:
-        return parallel_env(scenario)
+        return parallel_env(scenario, n_flocks=n_flocks)
     make_expert = EXPERTS[train_env.expert]
     return ExpertEnv(
         scenario,
@@ -199,6 +202,7 @@ def _make_flock(config: TrainingConfig, scenario: Scenario) -> parallel_env:
         train_env.expert_fraction,
         train_env.expert_noise_std,
         queries=config.algorithm.bc_coef > 0,
+        n_flocks=n_flocks,
     )
 
 

@@ -11,7 +11,7 @@ from sb3_flock.envs.multi_flock import MultiFlockEnv
 from sb3_flock.envs.vec_env import flatten
 from sb3_flock.settings import SettingsError
 from sb3_flock.sim import Scenario, World
-from tests.helpers import quiet, tiny
+from tests.helpers import assert_equal_rollouts, quiet, tiny
 
 CROWD = Scenario(n_vehicles=4, n_obstacles=2, arena=0.3, obstacle_arena=0.4, max_cycles=10)
 
@@ -98,7 +98,7 @@ def test_a_queried_expert_gives_its_action_in_every_step_of_every_episode(name):
         for _ in range(CROWD.max_cycles):
             world.load_state_dict(env.world.state_dict())
             other.load_state_dict(env.state_dict()["expert"]["memory"])
-            queried = env.state_dict()["expert"]["expert_actions"]
+            queried = env.state_dict()["expert"]["expert_actions"][0]
             actions = rng.uniform(env.world.action_low, env.world.action_high, (4, 2)).astype(np.float32)
             *_, infos = env.step(dict(zip(env.agents, actions, strict=True)))
             np.testing.assert_array_equal([info["expert_action"] for info in infos.values()], queried)
@@ -107,7 +107,7 @@ def test_a_queried_expert_gives_its_action_in_every_step_of_every_episode(name):
             assert all(("executed_action" in info) == drives for info in infos.values())
             done = [info.get("executed_action", action) for info, action in zip(infos.values(), actions, strict=True)]
             sensing, _ = world.step([done])
-            np.testing.assert_array_equal(other.act(sensing, CROWD)[0], env.state_dict()["expert"]["expert_actions"])
+            np.testing.assert_array_equal(other.act(sensing, CROWD), env.state_dict()["expert"]["expert_actions"])
     assert kinds == {True, False}
 
 
@@ -115,14 +115,14 @@ def test_a_queried_expert_gives_its_action_in_every_step_of_every_episode(name):
     ("name", "queries"),  # the config accepts no queries of olfati-saber, which integrates its own velocity
     [("orca", True), ("orca", False), ("mpc", True), ("mpc", False), ("olfati-saber", False)],
 )
-def test_a_state_continues_in_the_middle_of_an_episode(name, queries):
-    env, other = (ExpertEnv(CROWD, expert(name, n_iterations=20), 0.5, 0.1, queries) for _ in range(2))
+@pytest.mark.parametrize("n_flocks", [1, 3])
+def test_a_state_continues_in_the_middle_of_an_episode(name, queries, n_flocks):
+    env, other = (ExpertEnv(CROWD, expert(name, n_iterations=20), 0.5, 0.1, queries, n_flocks) for _ in range(2))
     rng = np.random.default_rng(3)
     kinds = set()
     env.reset(seed=0)
     other.reset(seed=9)
     for _ in range(8):
-        kinds.add(env.expert_drives)
         for step in range(CROWD.max_cycles):
             if step == 4:
                 other.load_state_dict(env.state_dict())
@@ -131,6 +131,7 @@ def test_a_state_continues_in_the_middle_of_an_episode(name, queries):
                 agent: rng.uniform(env.world.action_low, env.world.action_high).astype(np.float32) for agent in env.agents
             }
             ours = env.step(actions)
+            kinds |= {info["expert_drives"] for info in ours[4].values()}
             if step >= 4:
                 theirs = other.step(actions)
                 for agent in env.possible_agents:
@@ -184,6 +185,15 @@ def test_each_copy_queries_its_expert_in_its_own_world(num_cpus):
             assert all(flock.expert.world is flock.world for flock in flocks)
     finally:
         env.close()
+
+
+@pytest.mark.parametrize("queries", [True, False])
+@pytest.mark.parametrize("name", ["orca", "mpc", "olfati-saber"])
+def test_flocks_in_a_batch_equal_flocks_of_an_env_each(name, queries):
+    copies = flatten(ExpertEnv(CROWD, expert(name, n_iterations=20), 0.5, 0.1, queries), n_copies=5, seed=1)
+    batch = flatten(ExpertEnv(CROWD, expert(name, n_iterations=20), 0.5, 0.1, queries, n_flocks=5), seed=1)
+    drivers = assert_equal_rollouts(copies, batch, steps=25)  # over the ends of two episodes
+    assert any(0 < sum(info["expert_drives"] for info in infos) < 20 for infos in drivers)
 
 
 class Record(BaseCallback):

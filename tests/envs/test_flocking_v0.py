@@ -27,6 +27,7 @@ VARIANTS = [
     {"n_vehicles": 1, "n_obstacles": 0},
     {"n_vehicles": 2, "max_cycles": 7},
     {"motion_lag": 0.2},
+    {"n_flocks": 2, "max_cycles": 7},
 ]
 
 
@@ -199,3 +200,31 @@ def test_observations_are_fresh_arrays():
 def test_bad_arguments_are_refused_in_one_line(kwargs, message):
     with pytest.raises(SettingsError, match=message):
         flocking_v0.parallel_env(**kwargs)
+
+
+def test_several_flocks_are_shown_one_by_one():
+    env = flocking_v0.parallel_env(n_vehicles=2, n_obstacles=1, max_cycles=3, n_flocks=3, arena=0.2, obstacle_arena=0.4)
+    names = ["flock_0/vehicle_0", "flock_0/vehicle_1", "flock_1/vehicle_0"]
+    assert env.possible_agents[:3] == names
+    assert env.copy_at(2).agents == []
+    env.reset(seed=5)
+    alone = flocking_v0.parallel_env(env.scenario)
+    alone.reset(seed=7)
+    for _ in range(3):
+        one = env.copy_at(2)
+        assert one.possible_agents == one.agents == alone.agents
+        np.testing.assert_array_equal(one.state(), alone.state())
+        np.testing.assert_array_equal(one.state(), env.state()[4:])
+        env.step(dict.fromkeys(env.agents, np.array([0.1, 1.0])))
+        alone.step(dict.fromkeys(alone.agents, np.array([0.1, 1.0])))
+    assert env.copy_at(2).agents == alone.agents == []
+    assert alone.copy_at(0) is alone
+
+
+def test_a_state_of_another_number_of_flocks_is_refused():
+    env = flocking_v0.parallel_env(n_flocks=3)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="the state is of 3 flocks: 2 are needed"):
+        flocking_v0.parallel_env(n_flocks=2).load_state_dict(env.state_dict())
+    with pytest.raises(SettingsError, match="n_flocks = 0"):
+        flocking_v0.parallel_env(n_flocks=0)

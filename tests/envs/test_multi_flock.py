@@ -1,12 +1,14 @@
 import warnings
 
 import numpy as np
+import pytest
 
 from sb3_flock.envs.flocking_v0 import parallel_env
 from sb3_flock.envs.multi_flock import MultiFlockEnv
 from sb3_flock.envs.vec_env import flatten
 from sb3_flock.rl.callbacks import NeighborInclusiveReward
 from sb3_flock.sim import Scenario
+from tests.helpers import assert_equal_rollouts
 
 with warnings.catch_warnings():  # importing PettingZoo's tests imports its deprecated modules
     warnings.simplefilter("ignore", DeprecationWarning)
@@ -15,8 +17,8 @@ with warnings.catch_warnings():  # importing PettingZoo's tests imports its depr
 CROWDED = Scenario(arena=0.3, link_range=0.3, max_cycles=6)
 
 
-def three_flocks():
-    return MultiFlockEnv([parallel_env(CROWDED, n_vehicles=n) for n in (2, 5, 1)])
+def three_flocks(n_copies=1):
+    return MultiFlockEnv([parallel_env(CROWDED, n_vehicles=n, n_flocks=n_copies) for n in (2, 5, 1)])
 
 
 def test_it_is_a_parallel_env_that_can_be_reset_after_its_end():
@@ -46,8 +48,21 @@ def test_a_flock_moves_as_it_does_alone():
     assert env.agents == [] == alone.agents
 
 
-def test_rewards_are_mixed_within_a_flock():
-    venv = flatten(three_flocks(), n_copies=2, seed=0)
+def test_copies_in_a_batch_equal_copies_of_the_env():
+    copies, batch = flatten(three_flocks(), n_copies=3, seed=2), flatten(three_flocks(n_copies=3), seed=2)
+    assert_equal_rollouts(copies, batch, steps=14)  # over the ends of two episodes
+    assert copies.n_agents == batch.n_agents == 8
+    names = batch.env_method("copy_at", 0, indices=0)[0].possible_agents
+    assert names == three_flocks().possible_agents
+    for slot in (0, 8, 16):
+        ours, theirs = copies.get_attr("flocks", slot)[0], batch.get_attr("flocks", slot)[0]
+        for one, other in zip(ours, theirs, strict=True):
+            np.testing.assert_array_equal(one.world.positions, other.world.positions)
+
+
+@pytest.mark.parametrize("n_copies", [1, 2])
+def test_rewards_are_mixed_within_a_flock(n_copies):
+    venv = flatten(three_flocks(n_copies), n_copies=2 // n_copies, seed=0)
     assert (venv.num_envs, venv.n_agents) == (16, 8)
     venv.reset()
     for _ in range(5):
@@ -59,8 +74,9 @@ def test_rewards_are_mixed_within_a_flock():
     assert any(len(info["neighbors"]) for info in infos[2:7])
 
 
-def test_a_state_continues_to_the_last_bit():
-    one, other = flatten(three_flocks(), 2, seed=4), flatten(three_flocks(), 2, seed=5)
+@pytest.mark.parametrize("n_copies", [1, 2])
+def test_a_state_continues_to_the_last_bit(n_copies):
+    one, other = (flatten(three_flocks(n_copies), 2 // n_copies, seed=seed) for seed in (4, 5))
     rng = np.random.default_rng(1)
     one.reset()
     other.reset()

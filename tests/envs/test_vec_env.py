@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import VecMonitor, VecVideoRecorder
 
 from sb3_flock import FlockCNN, Scenario, flatten, flocking_v0, make_vec_env
 from sb3_flock.settings import SettingsError
+from tests.helpers import assert_equal_rollouts
 
 SCENARIO = Scenario(n_vehicles=3, n_obstacles=1, max_cycles=5)
 
@@ -101,6 +102,27 @@ def test_a_model_takes_a_seed_and_repeats_from_it():
     assert not np.array_equal(parameters[0], parameters[2])
 
 
+@pytest.mark.parametrize(
+    "fields", [{}, {"motion_lag": 0.2, "sensors": {"position_noise": 0.01, "dropout": 0.2, "delay": 0.2}}]
+)
+def test_a_batch_equals_flocks_of_an_env_each(num_cpus, fields):
+    scenario = SCENARIO.replace(arena=0.2, obstacle_arena=0.4, **fields)
+    batch = make_vec_env(scenario, n_flocks=5, num_cpus=num_cpus, seed=3)  # shared unevenly among two workers
+    copies = flatten(flocking_v0.parallel_env(scenario), n_copies=5, num_cpus=num_cpus, seed=3)
+    try:
+        assert batch.n_agents == copies.n_agents == 3
+        infos = assert_equal_rollouts(copies, batch, steps=12)  # over the ends of two episodes
+        assert any(len(info["neighbors"]) for info in infos[-1])
+    finally:
+        batch.close()
+        copies.close()
+
+
+def test_copies_of_a_batch_are_refused_because_their_seeds_would_overlap():
+    with pytest.raises(SettingsError, match="n_copies = 2: 1 is needed"):
+        flatten(flocking_v0.parallel_env(SCENARIO, n_flocks=3), n_copies=2)
+
+
 # 2. - 5. The end of an episode
 
 
@@ -174,7 +196,7 @@ def test_attributes_and_methods_of_the_copies_are_reachable_through_wrappers():
     assert env.render_mode == "rgb_array"
     assert env.n_agents == 3
     env.set_attr("marker", 1, indices=[4])
-    assert [getattr(copy, "marker", 0) for copy in (e.par_env for e in env.venv.venv.vec_envs)] == [0, 1]
+    assert [getattr(copy, "marker", 0) for copy in env.get_attr("unwrapped", indices=[0, 3])] == [0, 1]
     assert env.env_method("action_space", "vehicle_0", indices=0) == [env.action_space]
     assert env.env_is_wrapped(VecMonitor) == [False] * 6
     assert env.has_attr("scenario")

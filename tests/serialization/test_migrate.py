@@ -10,12 +10,17 @@ import numpy as np
 import pytest
 import torch as th
 import yaml
+from gymnasium.utils.env_checker import data_equivalence
 
 from sb3_flock import FlockCNN, load_policy, resume
 from sb3_flock._renamed import FIELDS, POLICIES, RenamedWarning
 from sb3_flock.config.training import TrainingConfig
+from sb3_flock.controllers import EXPERTS
 from sb3_flock.controllers.policy import PolicyController
-from sb3_flock.envs.flocking_v0 import observation_space
+from sb3_flock.envs.expert_env import ExpertEnv
+from sb3_flock.envs.flocking_v0 import observation_space, parallel_env
+from sb3_flock.envs.multi_flock import MultiFlockEnv
+from sb3_flock.envs.vec_env import flatten
 from sb3_flock.evaluation.rollout import rollout
 from sb3_flock.serialization.load import PolicyError
 from sb3_flock.serialization.migrate import FORMAT, check_format, migrate_config, migrate_state, migrate_weights
@@ -326,3 +331,75 @@ def test_a_migrated_policy_saved_again_has_the_present_format(model, tmp_path):
     with zipfile.ZipFile(path) as archive:
         config = json.loads(archive.read("flock.json"))["config"]
     assert migrate_config(TrainingConfig, config, FORMAT) == (config, [])
+
+
+def flock_by_flock(env):
+    """The state of a vector env with one flock in every copy, as the first checkpoints kept it."""
+
+    def of_one_flock(state):
+        if "flocks" in state:
+            return {"flocks": [of_one_flock(flock) for flock in state["flocks"]]}
+        old = {"world": state["world"], "rng": state["rngs"][0]}
+        if "expert" in state:
+            expert = state["expert"] and dict(state["expert"])
+            if expert:
+                expert.pop("drives")
+                for name in ("expert_actions", "next_actions"):
+                    expert[name] = None if expert[name] is None else expert[name][0]
+            old["expert"] = expert
+        return old
+
+    return [of_one_flock(copy) for copy in env.state_dict()]
+
+
+CROWD = Scenario(
+    n_vehicles=3,
+    n_obstacles=2,
+    arena=0.3,
+    obstacle_arena=0.4,
+    max_cycles=8,
+    motion_lag=0.2,
+    sensors={"delay": 0.1, "dropout": 0.1},
+)
+
+
+def plain(n_flocks):
+    return parallel_env(CROWD, n_flocks=n_flocks)
+
+
+def several_sizes(n_flocks):
+    return MultiFlockEnv([parallel_env(CROWD, n_vehicles=size, n_flocks=n_flocks) for size in (2, 4)])
+
+
+def with_expert(name, fraction, queries):
+    return lambda n_flocks: ExpertEnv(CROWD, lambda world: EXPERTS[name](world, None), fraction, 0.1, queries, n_flocks)
+
+
+@pytest.mark.parametrize(
+    "make_env",
+    [
+        plain,
+        several_sizes,
+        with_expert("orca", 0.5, True),
+        with_expert("orca", 0.5, False),
+        with_expert("orca", 0.0, True),
+        with_expert("orca", 0.0, False),
+        with_expert("olfati-saber", 0.5, False),
+    ],
+)
+def test_states_of_single_flocks_continue_in_a_batch(make_env):
+    old, new = flatten(make_env(1), n_copies=5, seed=1), flatten(make_env(5), seed=2)
+    rng = np.random.default_rng(0)
+    old.reset()
+    new.reset()
+    for step in range(20):  # over the ends of two episodes
+        if step == 4:
+            state = migrate_state({"model": {"env": flock_by_flock(old), "replay": 1}}, FORMAT)
+            assert state["model"]["replay"] == 1
+            assert migrate_state(state, FORMAT) == state
+            new.load_state_dict(state["model"]["env"])
+        actions = rng.uniform((0, -3), (0.15, 3), (old.num_envs, 2)).astype(np.float32)
+        ours, theirs = old.step(actions), new.step(actions)
+        if step >= 4:
+            for mine, yours in zip(ours, theirs, strict=True):
+                assert data_equivalence(mine, yours, exact=True)
