@@ -20,11 +20,17 @@ BATCH = 250
 
 
 def rollout(
-    controller: Controller, scenario: Scenario, episodes: int, seed: int, batch: int = BATCH
+    controller: Controller,
+    scenario: Scenario,
+    episodes: int,
+    seed: int,
+    batch: int = BATCH,
+    watch: Callable[[World], None] = lambda world: None,
 ) -> dict[str, NDArray[np.float64]]:
     """Simulate episodes 0 ... ``episodes - 1`` of a seed.
 
     :param batch: episodes simulated at once; it does not change the results
+    :param watch: called with the world of the first batch at the start and after each step
     :return: each metric's value for each episode, ``(episodes,)``
     :raises SettingsError: for counts that are not accepted
     """
@@ -33,24 +39,30 @@ def rollout(
     results = []
     for start in range(0, episodes, batch):
         rngs = [episode_rng(seed, episode) for episode in range(start, min(start + batch, episodes))]
-        results.append(rollout_batch(lambda world: controller, scenario, rngs))
+        results.append(rollout_batch(lambda world: controller, scenario, rngs, *([] if start else [watch])))
     return {name: np.concatenate([result[name] for result in results]) for name in results[0]}
 
 
 def rollout_batch(
-    make_controller: Callable[[World], Controller], scenario: Scenario, rngs: Sequence[np.random.Generator]
+    make_controller: Callable[[World], Controller],
+    scenario: Scenario,
+    rngs: Sequence[np.random.Generator],
+    watch: Callable[[World], None] = lambda world: None,
 ) -> dict[str, NDArray[np.float64]]:
     """Simulate a batch of episodes in lockstep.
 
     :param make_controller: makes the controller of a world; a privileged one may read the whole world
     :param rngs: one generator per episode
+    :param watch: called with the world at the start and after each step
     :return: each metric's value for each episode, ``(episodes,)``
     """
     metrics = EpisodeMetrics(scenario, len(rngs))
     world, sensing, controller = _start(make_controller, scenario, rngs)
+    watch(world)
     for _ in range(scenario.max_cycles):
         sensing, executed = world.step(controller.act(world.sensors.measure(sensing), scenario))
         metrics.update(world, sensing, own_reward(reward_terms(sensing, executed, scenario.reward, scenario)))
+        watch(world)
     return metrics.result()
 
 

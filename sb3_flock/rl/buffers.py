@@ -99,11 +99,10 @@ class CompactReplayBuffer(ReplayBuffer):
         infos: list[dict[str, Any]],
     ) -> None:
         """Store one vector step."""
+        obs, next_obs = _to_half(obs), _to_half(next_obs)
         self._last_observations.pop(self.pos, None)
         if done.any():
-            self._last_observations[self.pos] = {
-                env: next_obs[env].astype(np.float16) for env in np.flatnonzero(done).tolist()
-            }
+            self._last_observations[self.pos] = {env: next_obs[env].copy() for env in np.flatnonzero(done).tolist()}
         if self.expert_actions is not None:
             if not all("expert_action" in info for info in infos):
                 raise SettingsError(
@@ -208,3 +207,9 @@ def _rows(buffer: ReplayBuffer) -> dict[str, NDArray[Any]]:
         for name, value in vars(buffer).items()
         if isinstance(value, np.ndarray) and value.shape[:2] == (buffer.buffer_size, buffer.n_envs)
     }
+
+
+def _to_half(observations: NDArray[Any]) -> NDArray[np.float16]:
+    """Observations in half precision; NumPy rounds alike, but slowly where Gaussians fade out."""
+    half: NDArray[np.float16] = th.from_numpy(np.ascontiguousarray(observations, np.float32)).half().numpy()
+    return half

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict, deque
 from collections.abc import Mapping
 from typing import Any
@@ -63,8 +64,8 @@ class NeighborInclusiveReward(BaseCallback):
     def _on_step(self) -> bool:
         rewards, infos = self.locals["rewards"], self.locals["infos"]
         dones = np.asarray(self.locals["dones"], dtype=bool)  # SuperSuit's own wrapper gives integers
-        for info, reward in zip(infos, rewards, strict=True):
-            info["reward"] = float(reward)
+        for info, reward in zip(infos, rewards.tolist(), strict=True):
+            info["reward"] = reward
         rewards[:] = self.mix(rewards, infos)
         self._returns += rewards
         if dones.any():
@@ -84,10 +85,10 @@ class NeighborInclusiveReward(BaseCallback):
 
     def mix(self, rewards: np.ndarray, infos: list[dict[str, Any]]) -> np.ndarray:
         """The mixed reward of every slot of the vector env, ``(slots,)``."""
-        neighbors = [np.asarray(info.get("neighbors", ()), dtype=np.int64) for info in infos]
+        neighbors = [info.get("neighbors", ()) for info in infos]
         observers = np.repeat(np.arange(len(infos)), [len(found) for found in neighbors])
         first = observers - observers % self._agents_per_copy  # slot of the copy's first agent
-        return mix_rewards(rewards, observers, first + np.concatenate(neighbors), self.lambda_)
+        return mix_rewards(rewards, observers, first + np.concatenate(neighbors).astype(np.int64), self.lambda_)
 
 
 class StoreExecutedActions(BaseCallback):
@@ -119,9 +120,10 @@ class FlockMetrics(BaseCallback):
         for info in self.locals["infos"]:
             if info.get("expert_drives"):
                 continue
-            for name, value in {**info.get("metrics", {}), **info.get("reward_terms", {})}.items():
-                if np.isfinite(value):
-                    self._sums[name] += value
+            for values in (info.get("metrics", {}), info.get("reward_terms", {})):
+                for name, value in values.items():
+                    if math.isfinite(value):
+                        self._sums[name] += value
             self._count += 1
         if self.locals["dones"].any():
             for name, total in self._sums.items():

@@ -117,6 +117,11 @@ class _FlockPolicyMixin(BasePolicy):
             **kwargs,
         )
 
+    def set_training_mode(self, mode: bool) -> None:
+        """As SB3's, which visits every module at every prediction: only where the mode changes."""
+        if self.training != mode:
+            super().set_training_mode(mode)
+
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Any:
         actor = super().make_actor(features_extractor)  # type: ignore[misc]
         init_output_layer(actor.mu, self._action_layer_kwargs["final_init"])

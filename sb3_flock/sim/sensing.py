@@ -71,7 +71,8 @@ class Contacts:
 
     def by_observer(self) -> list[NDArray[np.int64]]:
         """The bodies that each vehicle senses, ascending; one array a vehicle."""
-        return np.split(self.bodies, np.cumsum(self.count().ravel())[:-1])
+        ends = np.cumsum(self.count()).tolist()
+        return [self.bodies[start:end] for start, end in zip([0, *ends], ends, strict=False)]
 
     def compensate_ego_motion(self, ego_motion: NDArray[np.float64]) -> Contacts:
         """The same bodies, where they were, in the observers' frames after a further ego-motion ``(contacts, 2)``."""

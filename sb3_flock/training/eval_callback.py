@@ -19,7 +19,7 @@ from sb3_flock.evaluation.report import short_summary
 from sb3_flock.evaluation.rollout import rollout
 from sb3_flock.serialization.save import atomic_write
 from sb3_flock.sim import Scenario
-from sb3_flock.viz.figures import plot_trajectories, record_trajectory
+from sb3_flock.viz.figures import TrajectoryRecorder, plot_trajectories
 
 SELECTION_SEED = 1_000_000
 """Seed of the episodes on which the best model is chosen; no result is reported on them."""
@@ -80,14 +80,15 @@ class FlockEvalCallback(BaseCallback):
             self._evaluate()
 
     def _evaluate(self) -> None:
-        values = rollout(PolicyController(self.model), self.scenario, self.n_eval_episodes, SELECTION_SEED)
+        recorder = TrajectoryRecorder(self.scenario)
+        values = rollout(PolicyController(self.model), self.scenario, self.n_eval_episodes, SELECTION_SEED, watch=recorder)
         means = {name: float(np.nanmean(value)) if not np.isnan(value).all() else np.nan for name, value in values.items()}
         current = score(means)
         for name, mean in {**means, "score": current}.items():
             self.logger.record(f"eval/{name}", mean)
             self._history.setdefault(name, []).append(mean)
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
-        self._log_trajectory()
+        self._log_trajectory(recorder)
         self._last = self.num_timesteps
         self._history["timesteps"].append(self.num_timesteps)
         self._history["seconds"].append(time.monotonic() - self._started)
@@ -105,9 +106,8 @@ class FlockEvalCallback(BaseCallback):
         best = " (best)" if is_best else ""
         self.report(f"evaluation at {self.num_timesteps}: {short_summary(means)}, score {current:.3f}{best}")
 
-    def _log_trajectory(self) -> None:
+    def _log_trajectory(self, recorder: TrajectoryRecorder) -> None:
         """The paths of the first of these episodes, as a figure for TensorBoard where matplotlib is installed."""
         if importlib.util.find_spec("matplotlib") is not None:
-            trajectory = record_trajectory(PolicyController(self.model), self.scenario, SELECTION_SEED)
-            figure = Figure(plot_trajectories(trajectory), close=False)
+            figure = Figure(plot_trajectories(recorder.trajectory()), close=False)
             self.logger.record("eval/trajectory", figure, exclude=("stdout", "log", "json", "csv"))

@@ -40,13 +40,32 @@ class Trajectory:
     """``(steps + 1, 2)`` [m]."""
 
 
+class TrajectoryRecorder:
+    """Keeps the positions of a world's first flock, each time that it is called with the world.
+
+    :param scenario: the task
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        self.scenario = scenario
+        self._seen: list[tuple[NDArray[np.float64], ...]] = []
+
+    def __call__(self, world: World) -> None:
+        self._seen.append((world.positions[0], world.obstacle_positions[0], world.waypoints[0]))
+
+    def trajectory(self) -> Trajectory:
+        """What was seen so far."""
+        return Trajectory(self.scenario, *(np.stack(parts) for parts in zip(*self._seen, strict=True)))
+
+
 def record_trajectory(policy: Any, scenario: Scenario, seed: int = 0, episode: int = 0) -> Trajectory:
     """Simulate one episode and keep every position; the parameters are those of
     :func:`~sb3_flock.evaluation.rollout.iter_rollout`.
     """
-    worlds = iter_rollout(policy, scenario, seed, episode)
-    seen = [(world.positions[0], world.obstacle_positions[0], world.waypoints[0]) for world in worlds]
-    return Trajectory(scenario, *(np.stack(parts) for parts in zip(*seen, strict=True)))
+    recorder = TrajectoryRecorder(scenario)
+    for world in iter_rollout(policy, scenario, seed, episode):
+        recorder(world)
+    return recorder.trajectory()
 
 
 def new_figure(width: float = 5.0, height: float = 4.0, columns: int = 1, rows: int = 1) -> tuple[Figure, Any]:

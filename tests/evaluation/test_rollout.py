@@ -108,6 +108,15 @@ def test_one_episode_is_the_batchs_episode_of_that_number():
             next(iter_rollout(GoToWaypoint(), SCENARIO, **{name: -1}))
 
 
+def test_the_first_batch_can_be_watched():
+    seen = []
+    rollout(GoToWaypoint(), SCENARIO, 5, seed=2, batch=3, watch=lambda world: seen.append((world.steps, world.positions)))
+    assert [steps for steps, _ in seen] == list(range(41))
+    for episode in range(3):
+        alone = [world.positions[0] for world in iter_rollout(GoToWaypoint(), SCENARIO, seed=2, episode=episode)]
+        np.testing.assert_array_equal([positions[episode] for _, positions in seen], alone)
+
+
 def test_a_batch_takes_its_controller_from_the_world():
     made = []
 

@@ -105,6 +105,15 @@ def test_a_full_buffer_holds_the_newest_transitions_and_their_next_observations(
     assert len(compact._last_observations) <= 21
 
 
+def test_observations_are_rounded_to_the_nearest_half_as_numpy_does():
+    buffer = CompactReplayBuffer(8, *SPACES, n_envs=N_ENVS)
+    rng = np.random.default_rng(0)
+    maps = (10.0 ** rng.uniform(-9, 4, (2, N_ENVS, *SPACES[0].shape))).astype(np.float32)
+    buffer.add(*maps, np.zeros((N_ENVS, 2)), np.zeros(N_ENVS), np.array([True, False, False, False]), [{}] * N_ENVS)
+    np.testing.assert_array_equal(buffer.observations[:2], maps.astype(np.float16))
+    np.testing.assert_array_equal(buffer._last_observations[0][0], maps[1, 0].astype(np.float16))
+
+
 def test_a_million_transitions_fit_into_a_gigabyte():
     buffer = CompactReplayBuffer(1_000_000, *SPACES, device="cpu", n_envs=40)
     arrays = (buffer.observations, buffer.actions, buffer.rewards, buffer.dones, buffer.timeouts)

@@ -126,3 +126,14 @@ def test_the_policy_by_itself_has_the_settings_that_learn():
     for (name, value), (same, expected) in zip(policy.state_dict().items(), built.state_dict().items(), strict=True):
         assert name == same
         th.testing.assert_close(value, expected, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("policy_class", [FlockPolicy, FlockSACPolicy])
+def test_the_mode_reaches_every_module_and_costs_nothing_where_it_is_set(policy_class, monkeypatch):
+    policy = build(policy_class)
+    for mode in (False, True):
+        policy.set_training_mode(mode)
+        assert {module.training for network in (policy.actor, policy.critic) for module in network.modules()} == {mode}
+    policy.set_training_mode(False)
+    monkeypatch.setattr(policy.actor, "set_training_mode", None)  # calling it would be an error
+    policy.predict(OBSERVATIONS.numpy())
