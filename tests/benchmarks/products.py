@@ -50,24 +50,23 @@ def flops(products):
     return 2 * int(products[:, 1:].prod(1).sum())
 
 
-def run_products(products, updates):
-    """Compute the products so many times, each layer's on memory of its own."""
+def memory_of(products):
+    """Memory for the products, used again and again: the caches hold as much as they can."""
     samples, inputs, outputs = products[:, 1:].T
-    memory = [np.full(numbers.sum(), 0.01, np.float32) for numbers in (samples * inputs, samples * outputs, inputs * outputs)]
-    _run(products, updates, *memory)
+    rng = np.random.default_rng(0)
+    sizes = [int(numbers.max()) for numbers in (samples * inputs, samples * outputs, inputs * outputs)]
+    return *(rng.normal(size=size).astype(np.float32) for size in sizes), np.zeros(max(sizes), np.float32)
 
 
 @njit(error_model="numpy")
-def _run(products, updates, below, above, weights):
+def run_products(products, updates, below, above, weights, out):
+    """Compute the products so many times, on :func:`memory_of` them."""
     for _ in range(updates):
-        at_below, at_above, at_weights = 0, 0, 0
         for kind, n, inputs, outputs in products:
-            x, y = matrix(below, at_below, n, inputs), matrix(above, at_above, n, outputs)
-            weight = matrix(weights, at_weights, outputs, inputs)
+            x, y, weight = matrix(below, 0, n, inputs), matrix(above, 0, n, outputs), matrix(weights, 0, outputs, inputs)
             if kind == FORWARD:
-                product_transposed(x, weight, y)
+                product_transposed(x, weight, matrix(out, 0, n, outputs))
             elif kind == DOWN:
-                product(y, weight, x)
+                product(y, weight, matrix(out, 0, n, inputs))
             else:
-                transposed_product(y, x, weight)
-            at_below, at_above, at_weights = at_below + x.size, at_above + y.size, at_weights + weight.size
+                transposed_product(y, x, matrix(out, 0, outputs, inputs))

@@ -107,20 +107,21 @@ def test_updates(benchmark, monkeypatch, shape, batch_size):
 def test_products_of_an_update(benchmark, monkeypatch, shape, batch_size):
     """The compiled update in one thread, and its matrix products alone, in turn: what limits it."""
     pytest.importorskip("numba")
-    from tests.benchmarks.products import flops, products_of, run_products
+    from tests.benchmarks.products import flops, memory_of, products_of, run_products
 
     monkeypatch.setattr(compiled_update, "update_threads", lambda: 1)
     config = SHAPES[shape]
     model = untrained_model(Kind(), config, make_vec_env(config.training_scenarios()[0], 8, seed=0))
     model.train(1, batch_size)
     products = products_of(model, batch_size)
+    memory = memory_of(products)
     seconds = {"update": [], "products": []}
 
     def one_round():
         start = time.perf_counter()
         model.train(UPDATES, batch_size)
         middle = time.perf_counter()
-        run_products(products, UPDATES)
+        run_products(products, UPDATES, *memory)
         seconds["update"].append((middle - start) / UPDATES)
         seconds["products"].append((time.perf_counter() - middle) / UPDATES)
 
