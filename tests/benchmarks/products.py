@@ -16,9 +16,9 @@ def products_of(model, batch_size):
     """The products of one update in order: rows of kind, samples, inputs and outputs of a layer, ``(products, 4)``."""
     shapes = _shapes(model, batch_size)
     n, area, n_actions = batch_size // HALVES, shapes.kernel_size**2, model.action_space.shape[0]
-    convolutions = [(n * positions, below * area, channels) for channels, below, positions, _ in shapes.convolutions.tolist()]
-    channels, _, positions, _ = shapes.convolutions[-1].tolist()
-    extractor = [*convolutions, (n, positions * channels, shapes.features)]
+    convolutions = shapes.convolutions.tolist()
+    extractor = [(n * positions, below * area, channels) for channels, below, positions, _ in convolutions]
+    extractor.append((n, convolutions[-1][0] * convolutions[-1][2], shapes.features))
 
     def head(widths):
         return [(n, below, above) for below, above in zip(widths[:-1].tolist(), widths[1:].tolist(), strict=True)]
@@ -36,7 +36,7 @@ def products_of(model, batch_size):
     critics = [join, *critic] * shapes.n_critics
     critic_step = [
         *forward([*extractor, *actor]), *forward([*extractor, *critics]), *forward([*extractor, *critics]),
-        *(backward(critic, True) + [(WEIGHTS, *join)]) * shapes.n_critics, *backward(extractor, False),
+        *[*backward(critic, True), (WEIGHTS, *join)] * shapes.n_critics, *backward(extractor, False),
     ]  # fmt: skip
     actor_step = [
         *forward(extractor), *forward([*extractor, *actor]), *forward([join, *critic]),

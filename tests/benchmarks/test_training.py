@@ -32,7 +32,7 @@ class Kind(NamedTuple):
     algorithm: type = FlockDDPG
     extractor: type = FlockCNN
     is_fused: bool = True
-    options: dict = {}
+    compiled: bool = True
     threads: int = 1
     """Threads of a compiled update; torch has one."""
     bc_coef: float = 0.0
@@ -42,7 +42,7 @@ STOCK = "sb3"
 KINDS = {
     STOCK: Kind(DDPG, PlainCNN, is_fused=False),  # SB3's DDPG, torch's convolutions and Adam, SB3's buffer
     "sb3 with FlockCNN and fused Adam": Kind(DDPG),  # --algo ddpg-sb3
-    "sb3_flock by torch": Kind(options={"compiled": False}),  # --algo ddpg without the fast extra
+    "sb3_flock by torch": Kind(compiled=False),  # --algo ddpg without the fast extra
     "sb3_flock compiled": Kind(),  # --algo ddpg
     "sb3_flock compiled, bc_coef": Kind(bc_coef=10.0),
     "sb3_flock compiled, two threads": Kind(threads=2),
@@ -51,8 +51,12 @@ KINDS = {
 
 def untrained_model(kind, config, env):
     """A model with a filled buffer and no update yet."""
-    with_bc = {"store_expert_actions": kind.bc_coef > 0, "mirror_augmentation": True}
-    compact = {"replay_buffer_class": CompactReplayBuffer, "replay_buffer_kwargs": with_bc}
+    own = {
+        "replay_buffer_class": CompactReplayBuffer,
+        "replay_buffer_kwargs": {"mirror_augmentation": True, "store_expert_actions": kind.bc_coef > 0},
+        "compiled": kind.compiled,
+        "bc_coef": kind.bc_coef,
+    }
     model = kind.algorithm(
         FlockPolicy,
         env,
@@ -63,9 +67,7 @@ def untrained_model(kind, config, env):
         },
         seed=0,
         device="cpu",
-        **(compact if kind.algorithm is FlockDDPG else {}),
-        **kind.options,
-        **({"bc_coef": kind.bc_coef} if kind.bc_coef else {}),
+        **(own if kind.algorithm is FlockDDPG else {}),
     )  # fmt: skip
     model.set_logger(configure(None, []))
     model.learn(3_200)
@@ -160,7 +162,6 @@ def test_profile_of_a_training(benchmark, tmp_path, monkeypatch):
     from sb3_flock.training.eval_callback import FlockEvalCallback
 
     timed(FlockDDPG, "train", "updates")
-    timed(CompactReplayBuffer, "sample", "updates: sampling the replay buffer")
     timed(ParameterSharingVecEnv, "step_wait", "environment, SuperSuit included")
     timed(FlockEvalCallback, "_evaluate", "evaluation")
     timed(CompactReplayBuffer, "add", "replay buffer, storing")
