@@ -9,6 +9,8 @@ import pytest
 HERE = Path(__file__).parent
 WITH_HELP = ("sweep_scale", "time_to_paper", "tune_controllers", "peers/training", "peers/worlds")
 OTHERS = ("full_sight", "plot_crowd", "value_of_spacing")
+PARTS = ("products", "peers/flax_networks")
+"""Modules that benchmarks import."""
 
 
 def run(*words):
@@ -18,7 +20,7 @@ def run(*words):
 def test_every_script_is_listed():
     scripts = [path.relative_to(HERE).with_suffix("").as_posix() for path in HERE.rglob("*.py")]
     scripts = {name for name in scripts if not name.startswith(("test_", "conftest", "__init__"))}
-    assert scripts == {*WITH_HELP, *OTHERS}
+    assert scripts == {*WITH_HELP, *OTHERS, *PARTS}
 
 
 @pytest.mark.parametrize("name", WITH_HELP)
