@@ -67,7 +67,8 @@ def register_controller(name: str) -> Callable[[type[Controller]], type[Controll
 def register_expert(name: str, make: Callable[..., Controller]) -> None:
     """Register an expert under a name, for ``train_env.expert``.
 
-    :param make: called with the :class:`~sb3_flock.sim.World` of the flock and the settings of the MPC expert
+    :param make: called with a :class:`~sb3_flock.sim.World` of the flocks that it acts for, one or several, and the settings
+        of the MPC expert
     :raises ValueError: if the name is taken
     """
     if EXPERTS.setdefault(name, make) is not make:
