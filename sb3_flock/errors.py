@@ -1,4 +1,4 @@
-"""The errors of the package that are not of one of its parts alone; importable in no time, unlike what raises them."""
+"""Errors that several parts of the package raise. This module imports nothing, so that the command line starts at once."""
 
 from __future__ import annotations
 

@@ -86,7 +86,7 @@ def overrides_of(assignments: list[str]) -> dict[str, Any]:
 
 
 def load_trusted_or_not(path: str | Path, device: str = "cpu", trust: bool = False) -> Any:
-    """A policy, whose small networks run on one thread; with a warning if code in its file may run."""
+    """A policy, with a warning if code in its file may run; torch is set to one thread, which small networks are fastest with."""
     import torch as th
 
     from sb3_flock.serialization.load import load_policy

@@ -120,7 +120,8 @@ class TrainingConfig(ModelSettings, TaskConfig):
         ge=0,
         le=1024,
         description="threads of torch, and of the compiled update, which has two at most; 0: of torch one for batches under "
-        "1024, where more are no faster, else one per core, and of the update two where there are two cores",
+        "1024, where more are no faster, else one per core, and of the update two where there are two cores, unless the "
+        "environment variable OMP_NUM_THREADS is 1",
     )
 
     eval_freq: Count = Field(10_000, description="transitions between evaluations; 0: none")

@@ -123,7 +123,6 @@ class parallel_env(ParallelEnv[str, Observation, Action]):  # noqa: N801 - Petti
         self._action_spaces = {name: action_space(self.scenario) for name in vehicles}
         self.world = World(self.scenario, n_flocks)
         self.rngs: list[np.random.Generator] = []
-        self._copies: dict[int, Self] = {}
         self._renderer: Any = None
 
     def observation_space(self, agent: str) -> spaces.Box:
@@ -192,12 +191,11 @@ class parallel_env(ParallelEnv[str, Observation, Action]):  # noqa: N801 - Petti
         """The env of one flock alone, to look at its present state; the env itself if there is one flock."""
         if self.n_copies == 1:
             return self
-        one = self._copies.get(index)
-        if one is None:
-            one = self._copies[index] = copy.copy(self)
-            one.n_copies, one.world, one._renderer = 1, World(self.scenario), None
-            one.possible_agents = list(self._action_spaces)
-        one.rngs, one.agents = self.rngs[index : index + 1], list(one.possible_agents) if self.agents else []
+        one = copy.copy(self)
+        one.n_copies, one.world, one._renderer = 1, World(self.scenario), None
+        one.possible_agents = list(self._action_spaces)
+        one.rngs = copy.deepcopy(self.rngs[index : index + 1])
+        one.agents = list(one.possible_agents) if self.agents else []
         if self.rngs:
             copy_flocks(self.world, slice(index, index + 1), one.world)
         return one

@@ -252,8 +252,17 @@ class ParameterSharingVecEnv(SB3VecEnvWrapper):
         return [getattr(env.unwrapped, attr_name) for env in self._copies(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Set an attribute on each slot's copy."""
-        for env in self._copies(indices):
+        """Set an attribute on each slot's copy; copies that one env simulates in a batch share theirs.
+
+        :raises NotImplementedError: for some of the slots, where the copies are simulated in a batch
+        """
+        if self._copies_per_env == 1 or self._has_workers:
+            for env in self._copies(indices):
+                setattr(env.unwrapped, attr_name, value)
+            return
+        if len(list(self._get_indices(indices))) < self.num_envs:
+            raise NotImplementedError(f"set_attr({attr_name!r}): the copies share their attributes; leave out indices")
+        for env in copies_in_process(self.venv):
             setattr(env.unwrapped, attr_name, value)
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:

@@ -11,6 +11,9 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
+ABORTED = 2**62
+"""Arrivals of a thread that has ended early: the other waits no longer."""
+
 _SPINS = 1000
 """Reads before a waiting thread yields its core."""
 
@@ -55,11 +58,12 @@ def _yield_core(typing_context: Any) -> Any:
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
-def wait_for_other(barrier: NDArray[np.int64], thread: int) -> None:
+def wait_for_other(barrier: NDArray[np.int64], thread: int) -> bool:
     """Return once both threads have called this the same number of times.
 
-    :param barrier: from :func:`new_barrier`
+    :param barrier: from :func:`new_barrier`; filled with :data:`ABORTED` by a thread that ends early
     :param thread: 0 or 1
+    :return: whether both threads go on
     """
     arrivals = _load(barrier, thread) + 1  # type: ignore[call-arg]
     _store(barrier, thread, arrivals)
@@ -68,3 +72,4 @@ def wait_for_other(barrier: NDArray[np.int64], thread: int) -> None:
         spins += 1
         if spins > _SPINS:
             _yield_core()
+    return _load(barrier, 1 - thread) != ABORTED

@@ -115,9 +115,9 @@ class CompactReplayBuffer(ReplayBuffer):
             )
         super().add(obs, next_obs, action, reward, done, infos)
 
-    def draw(self, batch_size: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def sample_indices(self, batch_size: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Draw a minibatch: row and env of each transition, each ``(batch,)``, from NumPy's global stream as SB3 does."""
-        if self.full:  # the row before the newest one has lost its next observation
+        if self.full:  # the row at pos holds the newest transition's next observation alone
             rows = (np.random.randint(1, self.buffer_size, size=batch_size) + self.pos) % self.buffer_size  # noqa: NPY002
         else:
             rows = np.random.randint(0, self.pos, size=batch_size)  # noqa: NPY002
@@ -128,14 +128,14 @@ class CompactReplayBuffer(ReplayBuffer):
     ) -> tuple[NDArray[np.int64], NDArray[np.float16]]:
         """The next observations of transitions that ended an episode, which are stored outside the rows.
 
-        :return: for each transition its row in the second array, or -1; ``(ends, pixels)``
+        :return: for each transition its row in the second array, or -1; ``(ends, numbers)``
         """
         index, last = np.full(rows.shape, -1, np.int64), list[NDArray[np.float16]]()
         for place in zip(*np.nonzero(self.dones[rows, envs]), strict=True):
             index[place] = len(last)
             last.append(self._last_observations[rows[place]][envs[place]].reshape(-1))
-        pixels = int(np.prod(self.observations.shape[2:]))
-        return index, np.array(last, dtype=np.float16).reshape(-1, pixels)
+        numbers = int(np.prod(self.observations.shape[2:]))
+        return index, np.array(last, dtype=np.float16).reshape(-1, numbers)
 
     def _get_samples(  # type: ignore[override]
         self, batch_inds: NDArray[np.int64], env: VecNormalize | None = None
@@ -144,8 +144,8 @@ class CompactReplayBuffer(ReplayBuffer):
         at = (batch_inds, env_indices)
         next_observations = self.observations[(batch_inds + 1) % self.buffer_size, env_indices]
         observations, actions, dones = self.observations[at], self.actions[at], self.dones[at]
-        for row in np.flatnonzero(dones):
-            next_observations[row] = self._last_observations[batch_inds[row]][env_indices[row]]
+        index, last = self.last_observations(*at)
+        next_observations[index >= 0] = last.reshape(-1, *next_observations.shape[1:])
         if self.mirror_augmentation:
             half = len(batch_inds) // 2
             for rows in (observations, next_observations):

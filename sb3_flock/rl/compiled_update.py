@@ -1,14 +1,15 @@
 """The compiled update of a model: its networks as flat memory, its minibatches as indices.
 
 The weights stay the torch modules' own memory: every parameter becomes a view of one flat tensor per network, and so do the
-optimizers' moments. Saving, loading and SB3 itself see nothing new.
+optimizers' moments. Saving and loading need no change.
 """
 
 from __future__ import annotations
 
 import functools
 import importlib
-import os
+import threading
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -20,70 +21,61 @@ from stable_baselines3.common.preprocessing import get_action_dim
 from torch import nn
 
 from sb3_flock.rl.buffers import CompactReplayBuffer
-from sb3_flock.rl.policies import FlockPolicy, InvertingBound
+from sb3_flock.rl.policies import ActionLayerCritic, FlockPolicy, InvertingBound
 from sb3_flock.rl.torch_layers import FlockCNN
 
 if TYPE_CHECKING:
     from stable_baselines3 import TD3
 
-    from sb3_flock.rl.update_kernels import Batches, Learned, Replay, Shapes, Workspace
+    from sb3_flock.rl.update_kernels import Batches, Network, ReplayArrays, Shapes, Workspace
 
 
 class CompiledUpdate:
-    """Updates a model of DDPG or TD3 by :func:`sb3_flock.rl.update_kernels.update`.
+    """Updates models of DDPG or TD3 by :func:`sb3_flock.rl.update_kernels.update`, whose memory it keeps between rounds.
 
-    One or two threads compute the halves of each minibatch (:func:`update_threads`) and end at the same bits.
-
-    :param model: the model; :func:`can_compile` says whether it can be compiled
+    One or two threads compute the halves of each minibatch and end at the same bits.
     """
 
-    def __init__(self, model: TD3) -> None:
-        from threadpoolctl import ThreadpoolController
-
-        kernels = compiled_kernels()
-        assert kernels is not None
-        self.kernels, self.model = kernels, model
+    def __init__(self) -> None:
         self._flat: dict[str, th.Tensor] = {}
         self._moments: dict[str, list[th.Tensor]] = {}
         self._gradients: dict[str, NDArray[np.float32]] = {}
-        self._memory: dict[int, tuple[Shapes, Workspace]] = {}
-        self._blas = ThreadpoolController().select(user_api="blas")
+        self._memory: tuple[Shapes, Workspace] | None = None
 
-    def __getstate__(self) -> dict[str, Any]:
-        """A copy of the model gets flat memory of its own at its next update."""
-        return {"model": self.model}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__init__(**state)  # type: ignore[misc]
+    def __reduce__(self) -> tuple[type[CompiledUpdate], tuple[()]]:
+        """A copy of a model has memory of its own."""
+        return CompiledUpdate, ()
 
     def __call__(
-        self, n_updates: int, batch_size: int, updates_before: int = 0, bc_coef: float = 0.0, threads: int = 0
+        self, model: TD3, n_updates: int, batch_size: int, updates_before: int = 0, bc_coef: float = 0.0, threads: int = 1
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Update the networks ``n_updates`` times.
+        """Update a model's networks ``n_updates`` times.
 
+        :param model: the model; :func:`can_compile` says whether its update can be compiled
         :param batch_size: transitions in a minibatch
         :param updates_before: updates so far, which decide when TD3 updates the actor
         :param bc_coef: weight of the behavior cloning term in the actor's loss
-        :param threads: as in :func:`update_threads`
+        :param threads: 1 or 2
         :return: the critics' losses; the actor's, for each of its updates; its behavior cloning losses, if there is such a term
         """
-        model = self.model
-        if batch_size not in self._memory:
+        from sb3_flock.rl.update_kernels import Hyperparameters
+
+        if self._memory is None or self._memory[0].batch != batch_size:
             shapes = _shapes(model, batch_size)
-            self._memory[batch_size] = shapes, _workspace(shapes, get_action_dim(model.action_space))
-        shapes, workspace = self._memory[batch_size]
+            self._memory = shapes, _workspace(shapes, get_action_dim(model.action_space))
+        shapes, workspace = self._memory
         updates_actor = (updates_before + 1 + np.arange(n_updates)) % model.policy_delay == 0
         losses = np.zeros((n_updates, 3))
-        self._run(
-            update_threads(threads),
+        _run(
+            threads,
             shapes,
-            self._learned("actor"),
-            self._learned("critic"),
-            self._replay(),
-            self._batches(n_updates, batch_size),
-            self.kernels.Rule(
-                model.gamma,
-                model.tau,
+            self._network(model, "actor"),
+            self._network(model, "critic"),
+            _replay_arrays(model),
+            _batches(model, n_updates, batch_size),
+            Hyperparameters(
+                float(model.gamma),
+                float(model.tau),
                 float(bc_coef),
                 _learning_rate(model.actor),
                 _learning_rate(model.critic),
@@ -98,122 +90,73 @@ class CompiledUpdate:
                 state["step"] += count
         return losses[:, 0], losses[updates_actor, 1], losses[updates_actor, 2] if bc_coef else np.empty(0)
 
-    def _run(self, threads: int, *arguments: Any) -> None:
-        """Run :func:`~sb3_flock.rl.update_kernels.update` in one thread or two."""
-        from sb3_flock.rl.barrier_kernels import new_barrier
+    def _network(self, model: TD3, name: str) -> Network:
+        from sb3_flock.rl.update_kernels import HALVES, Network
 
-        update, barrier = self.kernels.update, new_barrier()
-        with self._blas.limit(limits=1):
-            if threads == 1:
-                update(0, 1, barrier, *arguments)
-                return
-            with ThreadPoolExecutor(1) as pool:
-                second = pool.submit(update, 1, 2, barrier, *arguments)
-                update(0, 2, barrier, *arguments)
-                second.result()
+        online = self._flatten(name, getattr(model, name))
+        target = self._flatten(f"{name}_target", getattr(model, f"{name}_target"))
+        exp_avg, exp_avg_sq = self._flatten_moments(name, getattr(model, name))
+        if name not in self._gradients:
+            self._gradients[name] = np.zeros((HALVES, len(online)), np.float32)
+        return Network(online, exp_avg, exp_avg_sq, target, self._gradients[name])
 
-    def _replay(self) -> Replay:
-        buffer = self.model.replay_buffer
-        assert isinstance(buffer, CompactReplayBuffer)
-        return self.kernels.Replay(
-            buffer.observations.view(np.uint16).reshape(buffer.buffer_size, buffer.n_envs, -1),
-            buffer.actions,
-            buffer.rewards,
-            buffer.dones,
-            buffer.timeouts,
-            np.empty((0, 0, 0), np.float32) if buffer.expert_actions is None else buffer.expert_actions,
-        )
-
-    def _batches(self, n_updates: int, batch_size: int) -> Batches:
-        """Draw the minibatches of a round, in the order in which SB3 draws them."""
-        buffer = self.model.replay_buffer
-        assert isinstance(buffer, CompactReplayBuffer)
-        draws = [buffer.draw(batch_size) for _ in range(n_updates)]
-        rows, envs = (np.stack(parts) for parts in zip(*draws, strict=True))
-        last_index, last = buffer.last_observations(rows, envs)
-        noise, n_mirrored = self._target_noise(n_updates, batch_size), batch_size // 2 if buffer.mirror_augmentation else 0
-        return self.kernels.Batches(rows, envs, last_index, last.view(np.uint16), noise, n_mirrored)
-
-    def _learned(self, name: str) -> Learned:
-        online, target = self._flatten(name), self._flatten(f"{name}_target")
-        mean, square = self._flatten_moments(name)
-        return self.kernels.Learned(online, mean, square, target, self._gradients[name])
-
-    def _target_noise(self, n_updates: int, batch_size: int) -> NDArray[np.float32]:
-        """TD3's clipped noise on the target actions, drawn by torch as SB3 does; none for DDPG, whose clip is 0."""
-        model = self.model
-        if model.target_noise_clip == 0:
-            return np.empty((0, 0, 0), np.float32)
-        shape = (batch_size, *model.action_space.shape)  # type: ignore[misc]
-        noise = [th.empty(shape).normal_(0, model.target_policy_noise) for _ in range(n_updates)]
-        return th.stack(noise).clamp_(-model.target_noise_clip, model.target_noise_clip).numpy()
-
-    def _flatten(self, name: str) -> NDArray[np.float32]:
+    def _flatten(self, name: str, network: nn.Module) -> NDArray[np.float32]:
         """A network's parameters as one array, of which the parameters are views; moved there again if torch moved them."""
-        parameters = list(getattr(self.model, name).parameters())
+        parameters = list(network.parameters())
         flat = self._flat.get(name)
         if flat is None or not _are_views(parameters, flat):
             flat = self._flat[name] = th.cat([parameter.detach().reshape(-1) for parameter in parameters])
             for parameter, part in zip(parameters, _split(flat, parameters), strict=True):
                 parameter.data = part
-            self._gradients[name] = np.zeros((self.kernels.HALVES, len(flat)), np.float32)
         return flat.numpy()
 
-    def _flatten_moments(self, name: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def _flatten_moments(self, name: str, network: nn.Module) -> tuple[NDArray[np.float32], ...]:
         """The two moments of a network's Adam as arrays, of which the optimizer's state are views."""
-        network = getattr(self.model, name)
-        parameters, states = list(network.parameters()), network.optimizer.state
+        optimizer = network.optimizer
+        assert isinstance(optimizer, th.optim.Adam)
+        parameters, states = list(network.parameters()), optimizer.state
         for parameter in parameters:
             if not states[parameter]:
-                states[parameter]["step"] = th.zeros(())
-                for moment in ("exp_avg", "exp_avg_sq"):
-                    states[parameter][moment] = th.zeros_like(parameter)
-        keys = ("exp_avg", "exp_avg_sq")
+                states[parameter] = {
+                    "step": th.zeros(()),
+                    **{moment: th.zeros_like(parameter) for moment in _MOMENTS},
+                }
         kept = self._moments.get(name, [])
-        if not kept or not all(
-            _are_views([states[p][key] for p in parameters], flat) for key, flat in zip(keys, kept, strict=True)
-        ):
-            kept = [th.cat([states[p][key].reshape(-1) for p in parameters]) for key in keys]
-            self._moments[name] = kept
-            for key, flat in zip(keys, kept, strict=True):
+        tensors = [[states[parameter][moment] for parameter in parameters] for moment in _MOMENTS]
+        if not kept or not all(map(_are_views, tensors, kept)):
+            kept = self._moments[name] = [th.cat([tensor.reshape(-1) for tensor in parts]) for parts in tensors]
+            for moment, flat in zip(_MOMENTS, kept, strict=True):
                 for parameter, part in zip(parameters, _split(flat, parameters), strict=True):
-                    states[parameter][key] = part
-        mean, square = kept
-        return mean.numpy(), square.numpy()
+                    states[parameter][moment] = part
+        return tuple(flat.numpy() for flat in kept)
 
 
 def can_compile(model: TD3) -> bool:
-    """Whether a model's update can be compiled: the ``fast`` extra is installed, the model is on the CPU and has our parts."""
-    if compiled_kernels() is None:
-        return False
+    """Whether a model's update can be compiled: its parts are exactly ours, on the CPU, and the ``fast`` extra is installed."""
+    policy, networks = model.policy, (model.actor, model.critic)
     return (
-        isinstance(model.policy, FlockPolicy)
-        and isinstance(model.replay_buffer, CompactReplayBuffer)
+        type(policy) is FlockPolicy
+        and type(model.critic) is ActionLayerCritic
+        and type(model.replay_buffer) is CompactReplayBuffer
+        and all(type(network.features_extractor) is FlockCNN for network in networks)
+        and not policy.share_features_extractor
+        and policy.activation_fn is nn.ReLU
         and model.device.type == "cpu"
-        and all(
-            isinstance(network.features_extractor, FlockCNN) and type(network.features_extractor).forward is FlockCNN.forward
-            for network in (model.actor, model.critic)
-        )
-        and all(_is_plain_adam(network.optimizer) for network in (model.actor, model.critic))
+        and all(parameter.requires_grad for network in networks for parameter in network.parameters())
+        and all(_is_plain_adam(network) for network in networks)
+        and compiled_kernels() is not None
     )
 
 
-def _is_plain_adam(optimizer: th.optim.Optimizer) -> bool:
+def _is_plain_adam(network: nn.Module) -> bool:
+    """Whether torch's Adam with default coefficients optimizes all parameters of a network, and nothing else."""
     default: dict[str, Any] = {"betas": (0.9, 0.999), "eps": 1e-8, "weight_decay": 0, "amsgrad": False, "maximize": False}
-    groups = optimizer.param_groups
-    return type(optimizer) is th.optim.Adam and len(groups) == 1 and all(groups[0][k] == v for k, v in default.items())
-
-
-def update_threads(wanted: int = 0) -> int:
-    """Threads of an update: one or two, as wanted; 0: two where the process may use two cores, unless OMP_NUM_THREADS is 1."""
-    if os.name != "posix":  # the barrier yields the core by sched_yield
-        return 1
-    return min(wanted or (2 if cores() > 1 and os.environ.get("OMP_NUM_THREADS") != "1" else 1), 2)
-
-
-def cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    optimizer = network.optimizer
+    if not isinstance(optimizer, th.optim.Adam) or isinstance(optimizer, th.optim.AdamW) or len(optimizer.param_groups) != 1:
+        return False
+    (group,) = optimizer.param_groups
+    own = [id(parameter) for parameter in network.parameters()]
+    return all(group[key] == value for key, value in default.items()) and [id(p) for p in group["params"]] == own
 
 
 @functools.cache
@@ -225,6 +168,83 @@ def compiled_kernels() -> ModuleType | None:
         return importlib.import_module("sb3_flock.rl.update_kernels")
     except (ImportError, RuntimeError):  # RuntimeError: there is no folder where numba may keep its cache
         return None
+
+
+_MOMENTS = ("exp_avg", "exp_avg_sq")
+_LOCK = threading.Lock()
+"""One round at a time: the number of BLAS's threads is the process's."""
+
+
+@functools.cache
+def _blas() -> Any:
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController().select(user_api="blas")
+
+
+def _run(threads: int, *arguments: Any) -> None:
+    """Run :func:`~sb3_flock.rl.update_kernels.update` in one thread or two."""
+    from sb3_flock.rl.barrier_kernels import ABORTED, new_barrier
+    from sb3_flock.rl.update_kernels import update
+
+    barrier = new_barrier()
+
+    def run(thread: int) -> None:
+        try:
+            update(thread, threads, barrier, *arguments)
+        except BaseException:
+            barrier[:] = ABORTED  # the other thread would wait for ever
+            raise
+
+    with _LOCK, _blas().limit(limits=1):
+        if threads == 1:
+            run(0)
+            return
+        with ThreadPoolExecutor(1) as pool:
+            try:
+                second = pool.submit(run, 1)
+                run(0)
+            except BaseException:
+                barrier[:] = ABORTED
+                raise
+            second.result()
+
+
+def _replay_arrays(model: TD3) -> ReplayArrays:
+    from sb3_flock.rl.update_kernels import ReplayArrays
+
+    buffer = model.replay_buffer
+    assert isinstance(buffer, CompactReplayBuffer)
+    return ReplayArrays(
+        buffer.observations.view(np.uint16).reshape(buffer.buffer_size, buffer.n_envs, -1),
+        buffer.actions,
+        buffer.rewards,
+        buffer.dones,
+        buffer.timeouts,
+        np.empty((0, 0, 0), np.float32) if buffer.expert_actions is None else buffer.expert_actions,
+    )
+
+
+def _batches(model: TD3, n_updates: int, batch_size: int) -> Batches:
+    """Draw the minibatches of a round, in the order in which SB3 draws them."""
+    from sb3_flock.rl.update_kernels import Batches
+
+    buffer = model.replay_buffer
+    assert isinstance(buffer, CompactReplayBuffer)
+    draws = [buffer.sample_indices(batch_size) for _ in range(n_updates)]
+    rows, envs = (np.stack(parts) for parts in zip(*draws, strict=True))
+    last_index, last = buffer.last_observations(rows, envs)
+    n_mirrored = batch_size // 2 if buffer.mirror_augmentation else 0
+    return Batches(rows, envs, last_index, last.view(np.uint16), _target_noise(model, n_updates, batch_size), n_mirrored)
+
+
+def _target_noise(model: TD3, n_updates: int, batch_size: int) -> NDArray[np.float32]:
+    """TD3's clipped noise on the target actions, drawn by torch as SB3 does; none for DDPG, whose clip is 0."""
+    if model.target_noise_clip == 0:
+        return np.empty((0, 0, 0), np.float32)
+    shape = (batch_size, get_action_dim(model.action_space))
+    noise = [th.empty(shape).normal_(0, model.target_policy_noise) for _ in range(n_updates)]
+    return th.stack(noise).clamp_(-model.target_noise_clip, model.target_noise_clip).numpy()
 
 
 def _learning_rate(network: nn.Module) -> float:
@@ -335,7 +355,7 @@ def _split(flat: th.Tensor, parameters: list[Any]) -> list[th.Tensor]:
     return [part.view(parameter.shape) for part, parameter in zip(th.split(flat, sizes), parameters, strict=True)]
 
 
-def _are_views(tensors: list[th.Tensor], flat: th.Tensor) -> bool:
+def _are_views(tensors: Sequence[th.Tensor], flat: th.Tensor) -> bool:
     at = flat.data_ptr()
     for tensor in tensors:
         if tensor.data_ptr() != at:

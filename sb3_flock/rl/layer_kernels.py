@@ -7,7 +7,6 @@ Images are channels last: the numbers under one row of a kernel stand side by si
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 from numba import njit
@@ -22,8 +21,9 @@ _UNPACKED = 1_000_000
 """Multiplications of the largest product that OpenBLAS does without packing its factors first, with AVX-512."""
 _SMALLEST_NORMAL_HALF = np.float32(2.0**-14)
 
-_kernel: Any = njit(error_model="numpy", cache=True, fastmath={"reassoc", "contract", "nsz"})
-"""Sums may be reordered, so that they use the vector units; NaN and infinity stay what they are."""
+_kernel = njit(error_model="numpy", cache=True)
+"""Without numba's ``fastmath``: with it a function rounds otherwise where it was compiled into another one, and a process that
+compiles ends at other bits than one that loads the cache. Sums over rows go to BLAS, sums over columns use the vector units."""
 
 
 @_kernel
@@ -97,18 +97,19 @@ def sum_rows(gradient: Array, out: Array) -> None:
 def norm_relu(z: Array, bias: Array, weight: Array, norm_bias: Array, normed: Array, scale: Array, out: Array) -> None:
     """Bias, layer norm and ReLU; ``normed`` and ``scale`` are kept for the backward pass."""
     n, width = z.shape
+    share = np.full(width, ONE / np.float32(width))
+    mean, variance = np.empty(n, np.float32), np.empty(n, np.float32)
+    add_bias(z, bias)
+    np.dot(z, share, mean)
     for i in range(n):
-        total = ZERO
         for j in range(width):
-            z[i, j] += bias[j]
-            total += z[i, j]
-        mean = total / np.float32(width)
-        variance = ZERO
+            z[i, j] -= mean[i]
+            normed[i, j] = z[i, j] * z[i, j]
+    np.dot(normed, share, variance)
+    for i in range(n):
+        scale[i] = ONE / np.sqrt(variance[i] + _NORM_EPSILON)
         for j in range(width):
-            variance += (z[i, j] - mean) * (z[i, j] - mean)
-        scale[i] = ONE / np.sqrt(variance / np.float32(width) + _NORM_EPSILON)
-        for j in range(width):
-            normed[i, j] = (z[i, j] - mean) * scale[i]
+            normed[i, j] = z[i, j] * scale[i]
             out[i, j] = max(normed[i, j] * weight[j] + norm_bias[j], ZERO)
 
 
@@ -118,22 +119,21 @@ def norm_relu_backward(
 ) -> None:
     """The gradient in front of :func:`norm_relu`, in place, and those of its parameters."""
     n, width = out.shape
+    share = np.full(width, ONE / np.float32(width))
+    mean, product_mean, products = np.empty(n, np.float32), np.empty(n, np.float32), np.empty_like(out)
+    relu_backward(gradient, out)
+    sum_rows(gradient, d_norm_bias)
     d_weight[:] = 0
-    d_norm_bias[:] = 0
     for i in range(n):
-        mean, product_mean = ZERO, ZERO
         for j in range(width):
-            g = gradient[i, j] if out[i, j] > 0 else ZERO
-            d_weight[j] += g * normed[i, j]
-            d_norm_bias[j] += g
-            g *= weight[j]
-            gradient[i, j] = g
-            mean += g
-            product_mean += g * normed[i, j]
-        mean /= np.float32(width)
-        product_mean /= np.float32(width)
+            d_weight[j] += gradient[i, j] * normed[i, j]
+            gradient[i, j] *= weight[j]
+            products[i, j] = gradient[i, j] * normed[i, j]
+    np.dot(gradient, share, mean)
+    np.dot(products, share, product_mean)
+    for i in range(n):
         for j in range(width):
-            gradient[i, j] = (gradient[i, j] - mean - normed[i, j] * product_mean) * scale[i]
+            gradient[i, j] = (gradient[i, j] - mean[i] - normed[i, j] * product_mean[i]) * scale[i]
 
 
 @_kernel
@@ -191,7 +191,7 @@ def swap_inner(kernel: Array, out: Array, n_out: int, outer: int, inner: int) ->
 
 @_kernel
 def read_image(image: Array, half: NDArray[np.uint16], channels: int, side: int, is_mirrored: bool) -> None:
-    """An observation in half precision as an image in single precision, exactly.
+    """An observation in half precision as an image in single precision, exactly; NaN and infinity stay what they are.
 
     :param image: ``(positions * channels,)``, filled
     :param half: bits of the float16 observation, ``(channels * positions,)``
@@ -202,7 +202,8 @@ def read_image(image: Array, half: NDArray[np.uint16], channels: int, side: int,
     bits = values.view(np.uint32)
     for i in range(len(half)):
         magnitude = (u32(half[i]) & u32(0x7FFF)) << u32(13)
-        bits[i] = magnitude + (u32(113 << 23) if magnitude < u32(1 << 23) else u32(112 << 23))
+        shift = u32(113 << 23) if magnitude < u32(1 << 23) else u32(112 << 23)
+        bits[i] = magnitude + (u32(224 << 23) if magnitude >= u32(31 << 23) else shift)
     for i in range(len(half)):
         # A subnormal half was read as if it were the smallest normal one plus itself.
         value = values[i] - (_SMALLEST_NORMAL_HALF if half[i] & u32(0x7C00) == 0 else ZERO)

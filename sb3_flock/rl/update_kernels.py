@@ -8,6 +8,8 @@ other and ends at the same bits.
 
 from __future__ import annotations
 
+import zlib
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -43,9 +45,10 @@ from sb3_flock.rl.layer_kernels import (
 HALVES = 2
 """Parts of a minibatch, whose gradients are added."""
 
-_options: dict[str, Any] = {"error_model": "numpy", "cache": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+_options: dict[str, Any] = {"error_model": "numpy", "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 _kernel = njit(**_options)
-"""For functions that only compiled code calls: without wrappers for Python they compile twice as fast."""
+"""For functions that only compiled code calls: without wrappers for Python they compile twice as fast. Not cached: numba would
+load them although a function that they call, in another file, has changed."""
 
 
 class Shapes(NamedTuple):
@@ -76,19 +79,19 @@ class Shapes(NamedTuple):
     """Where the parameters of the critics' action layers start."""
 
 
-class Learned(NamedTuple):
-    """A network that an optimizer changes."""
+class Network(NamedTuple):
+    """A network with its target network and the moments of its optimizer, as torch's Adam names them."""
 
     parameters: Array
-    mean: Array
-    square: Array
+    exp_avg: Array
+    exp_avg_sq: Array
     target: Array
     """The target network's parameters."""
     gradients: Array
     """``(2, parameters)``, one row for each half of a minibatch."""
 
 
-class Replay(NamedTuple):
+class ReplayArrays(NamedTuple):
     """The arrays of a :class:`~sb3_flock.rl.buffers.CompactReplayBuffer`."""
 
     observations: NDArray[np.uint16]
@@ -115,8 +118,8 @@ class Batches(NamedTuple):
     """Samples at the start of a minibatch that are mirrored, left for right."""
 
 
-class Rule(NamedTuple):
-    """What an update does besides gradients."""
+class Hyperparameters(NamedTuple):
+    """Hyperparameters of an update."""
 
     gamma: float
     tau: float
@@ -306,7 +309,7 @@ def _head_backward(
 
 
 @_kernel
-def _join(features: Array, actions: Array, w: Array, at: int, action_layer: Array, joined: Array) -> None:
+def _concat_action(features: Array, actions: Array, w: Array, at: int, action_layer: Array, joined: Array) -> None:
     """A critic's action layer, whose parameters start at ``at``, and its concatenation with the features."""
     (n, width), n_actions, n_out = features.shape, actions.shape[1], action_layer.shape[1]
     product_transposed(actions, matrix(w, at, n_out, n_actions), action_layer)
@@ -319,8 +322,8 @@ def _join(features: Array, actions: Array, w: Array, at: int, action_layer: Arra
 
 
 @_kernel
-def _split(joined_back: Array, action_layer: Array, features_back: Array) -> None:
-    """The backward pass of :func:`_join`: adds to ``features_back``, and replaces ``action_layer`` by its gradient."""
+def _concat_action_backward(joined_back: Array, action_layer: Array, features_back: Array) -> None:
+    """The backward pass of :func:`_concat_action`: adds to ``features_back``, and replaces ``action_layer`` by its gradient."""
     n, width = features_back.shape
     for i in range(n):
         for j in range(width):
@@ -339,7 +342,7 @@ def _bound(raw: Array, is_inverting: bool, out: Array) -> None:
 
 @_kernel
 def _read_batch(
-    half: int, start: int, stop: int, u: int, shapes: Shapes, replay: Replay, batches: Batches, ws: Workspace
+    half: int, start: int, stop: int, u: int, shapes: Shapes, replay: ReplayArrays, batches: Batches, ws: Workspace
 ) -> None:
     """Copy the patches and actions of samples ``start`` to ``stop`` of minibatch ``u``."""
     n_rows, run = len(replay.observations), shapes.kernel_size * shapes.channels
@@ -368,11 +371,11 @@ def _critic_gradient(
     half: int,
     u: int,
     shapes: Shapes,
-    actor: Learned,
-    critic: Learned,
-    replay: Replay,
+    actor: Network,
+    critic: Network,
+    replay: ReplayArrays,
     batches: Batches,
-    rule: Rule,
+    hyper: Hyperparameters,
     ws: Workspace,
 ) -> None:
     """The critics' target of one half of minibatch ``u``, their losses and their gradient."""
@@ -405,14 +408,14 @@ def _critic_gradient(
                 chosen[b, k] = min(max(chosen[b, k] + batches.noise[u, start + b, k], -ONE), ONE)
     _extract(half, n, next_patches, critic.target, shapes, ws, features)
     for c in range(shapes.n_critics):
-        _join(features, chosen, critic.target, shapes.at_actions + c * n_action_layer, action_layer, joined)
+        _concat_action(features, chosen, critic.target, shapes.at_actions + c * n_action_layer, action_layer, joined)
         _head(joined, critic.target, shapes.at_head + c * n_head, shapes.critic_widths, hidden, value)
         for b in range(n):
-            target[b] = value[b, 0] if c == 0 else min(target[b], value[b, 0])
+            target[b] = value[b, 0] if c == 0 else np.minimum(target[b], value[b, 0])  # NaN stays NaN
     for b in range(n):
         row, env = batches.rows[u, start + b], batches.envs[u, start + b]
         has_ended = replay.dones[row, env] * (ONE - replay.timeouts[row, env])
-        target[b] = replay.rewards[row, env] + (ONE - has_ended) * np.float32(rule.gamma) * target[b]
+        target[b] = replay.rewards[row, env] + (ONE - has_ended) * np.float32(hyper.gamma) * target[b]
 
     w, g = critic.parameters, critic.gradients[half]
     _extract(half, n, patches, w, shapes, ws, features)
@@ -421,14 +424,14 @@ def _critic_gradient(
             features_back[i, j] = ZERO
     for c in range(shapes.n_critics):
         at, at_head = shapes.at_actions + c * n_action_layer, shapes.at_head + c * n_head
-        _join(features, actions, w, at, action_layer, joined)
+        _concat_action(features, actions, w, at, action_layer, joined)
         _head(joined, w, at_head, shapes.critic_widths, hidden, value)
         for b in range(n):
             difference = value[b, 0] - target[b]
             ws.losses[half, 0] += difference * difference
             value_back[b, 0] = np.float32(2) * difference / np.float32(shapes.batch)
         _head_backward(value_back, joined, w, g, at_head, shapes.critic_widths, hidden, hidden_back, joined_back, True)
-        _split(joined_back, action_layer, features_back)
+        _concat_action_backward(joined_back, action_layer, features_back)
         transposed_product(action_layer, actions, matrix(g, at, shapes.action_layer, n_actions))
         sum_rows(action_layer, g[at + shapes.action_layer * n_actions : at + n_action_layer])
     _extract_backward(half, n, features_back, patches, w, g, shapes, ws, features)
@@ -436,7 +439,7 @@ def _critic_gradient(
 
 @_kernel
 def _actor_gradient(
-    half: int, shapes: Shapes, actor: Learned, critic: Learned, n_actions: int, rule: Rule, ws: Workspace
+    half: int, shapes: Shapes, actor: Network, critic: Network, n_actions: int, hyper: Hyperparameters, ws: Workspace
 ) -> None:
     """The actor's losses on one half of the minibatch that :func:`_critic_gradient` read, and its gradient."""
     start, stop = _half(half, shapes.batch)
@@ -462,7 +465,7 @@ def _actor_gradient(
     _extract(half, n, patches, actor.parameters, shapes, ws, features)
     _head(features, actor.parameters, shapes.at_head, shapes.actor_widths, hidden, raw)
     _bound(raw, shapes.is_inverting, chosen)
-    _join(features_back, chosen, w, shapes.at_actions, action_layer, joined)
+    _concat_action(features_back, chosen, w, shapes.at_actions, action_layer, joined)
     _head(joined, w, shapes.at_head, shapes.critic_widths, ws.critic_hidden[half], value)
     for b in range(n):
         ws.losses[half, 1] -= value[b, 0]
@@ -480,10 +483,10 @@ def _actor_gradient(
         joined_back,
         False,
     )
-    _split(joined_back, action_layer, features_back)
+    _concat_action_backward(joined_back, action_layer, features_back)
     product(action_layer, matrix(w, shapes.at_actions, shapes.action_layer, n_actions), raw_back)
-    if rule.bc_coef > 0:
-        slope = np.float32(rule.bc_coef / (n_actions * shapes.batch))
+    if hyper.bc_coef > 0:
+        slope = np.float32(hyper.bc_coef / (n_actions * shapes.batch))
         for b in range(n):
             for k in range(n_actions):
                 difference = chosen[b, k] - expert[b, k]
@@ -499,13 +502,13 @@ def _actor_gradient(
 
 
 @_kernel
-def _step(half: int, network: Learned, learning_rate: float, step: int) -> None:
+def _step(half: int, network: Network, learning_rate: float, step: int) -> None:
     """One step of a network's optimizer, in one half of its parameters."""
     start, stop = _half(half, len(network.parameters))
     adam(
         network.parameters[start:stop],
-        network.mean[start:stop],
-        network.square[start:stop],
+        network.exp_avg[start:stop],
+        network.exp_avg_sq[start:stop],
         network.gradients[0, start:stop],
         network.gradients[1, start:stop],
         learning_rate,
@@ -514,23 +517,22 @@ def _step(half: int, network: Learned, learning_rate: float, step: int) -> None:
 
 
 @_kernel
-def _wait(barrier: NDArray[np.int64], thread: int, n_threads: int) -> None:
-    """Wait until the other thread is here, too, if there is one."""
-    if n_threads > 1:
-        wait_for_other(barrier, thread)
+def _goes_on(barrier: NDArray[np.int64], thread: int, n_threads: int) -> bool:
+    """Wait until the other thread is here, too, if there is one; false if it ended early."""
+    return n_threads == 1 or wait_for_other(barrier, thread)
 
 
-@njit(error_model="numpy", cache=True, nogil=True)
-def update(
+@_kernel
+def _update(
     thread: int,
     n_threads: int,
     barrier: NDArray[np.int64],
     shapes: Shapes,
-    actor: Learned,
-    critic: Learned,
-    replay: Replay,
+    actor: Network,
+    critic: Network,
+    replay: ReplayArrays,
     batches: Batches,
-    rule: Rule,
+    hyper: Hyperparameters,
     ws: Workspace,
     steps: tuple[int, int],
     updates_actor: NDArray[np.bool_],
@@ -550,25 +552,72 @@ def update(
     actor_step, critic_step = steps
     for u in range(len(batches.rows)):
         for half in range(thread, HALVES, n_threads):
-            _critic_gradient(half, u, shapes, actor, critic, replay, batches, rule, ws)
-        _wait(barrier, thread, n_threads)
+            _critic_gradient(half, u, shapes, actor, critic, replay, batches, hyper, ws)
+        if not _goes_on(barrier, thread, n_threads):
+            return
         critic_step += 1
         losses[u, 0] = (ws.losses[0, 0] + ws.losses[1, 0]) / batch
         for half in range(thread, HALVES, n_threads):
-            _step(half, critic, rule.critic_learning_rate, critic_step)
-        _wait(barrier, thread, n_threads)
+            _step(half, critic, hyper.critic_learning_rate, critic_step)
+        if not _goes_on(barrier, thread, n_threads):
+            return
         if not updates_actor[u]:
             continue
         for half in range(thread, HALVES, n_threads):
-            _actor_gradient(half, shapes, actor, critic, n_actions, rule, ws)
-        _wait(barrier, thread, n_threads)
+            _actor_gradient(half, shapes, actor, critic, n_actions, hyper, ws)
+        if not _goes_on(barrier, thread, n_threads):
+            return
         actor_step += 1
         bc_loss = (ws.losses[0, 2] + ws.losses[1, 2]) / (n_actions * batch)
-        losses[u, 1], losses[u, 2] = (ws.losses[0, 1] + ws.losses[1, 1]) / batch + rule.bc_coef * bc_loss, bc_loss
+        losses[u, 1], losses[u, 2] = (ws.losses[0, 1] + ws.losses[1, 1]) / batch + hyper.bc_coef * bc_loss, bc_loss
         for half in range(thread, HALVES, n_threads):
-            _step(half, actor, rule.actor_learning_rate, actor_step)
+            _step(half, actor, hyper.actor_learning_rate, actor_step)
         for network in (actor, critic):
             for half in range(thread, HALVES, n_threads):
                 start, stop = _half(half, len(network.parameters))
-                polyak(network.target[start:stop], network.parameters[start:stop], rule.tau)
-        _wait(barrier, thread, n_threads)
+                polyak(network.target[start:stop], network.parameters[start:stop], hyper.tau)
+        if not _goes_on(barrier, thread, n_threads):
+            return
+
+
+def _cached_by(sources: int) -> Any:
+    """:func:`_update` for Python, cached. Numba's key for a function has its closure, and so a checksum of other files."""
+
+    @njit(error_model="numpy", cache=True, nogil=True)
+    def update(
+        thread: int,
+        n_threads: int,
+        barrier: NDArray[np.int64],
+        shapes: Shapes,
+        actor: Network,
+        critic: Network,
+        replay: ReplayArrays,
+        batches: Batches,
+        hyper: Hyperparameters,
+        ws: Workspace,
+        steps: tuple[int, int],
+        updates_actor: NDArray[np.bool_],
+        losses: NDArray[np.float64],
+    ) -> None:
+        if sources >= 0:  # always: a variable is in the closure only where it is used
+            _update(
+                thread,
+                n_threads,
+                barrier,
+                shapes,
+                actor,
+                critic,
+                replay,
+                batches,
+                hyper,
+                ws,
+                steps,
+                updates_actor,
+                losses,
+            )
+
+    return update
+
+
+_OTHERS = ("barrier_kernels.py", "layer_kernels.py")
+update = _cached_by(zlib.crc32(b"".join(Path(__file__).with_name(name).read_bytes() for name in _OTHERS)))

@@ -250,12 +250,14 @@ class _NoOptimizer:
 
 def _build_policy(config: TrainingConfig) -> BasePolicy:
     _, policy_class = ALGORITHMS[config.algo].load()
-    return policy_class(
+    policy = policy_class(
         observation_space(config.scenario),
         action_space(config.scenario),
         lr_schedule=lambda _: 0.0,
         **{**policy_kwargs(config), "optimizer_class": _NoOptimizer},
     )
+    policy.optimizer_class = th.optim.Adam  # of a copy that is saved and loaded by SB3
+    return policy
 
 
 def _trusted_policy(path: Path, device: th.device) -> BasePolicy:

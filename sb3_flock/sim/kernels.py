@@ -245,6 +245,8 @@ def mix_rewards(
     """:func:`sb3_flock.sim.reward.mix_rewards`, flat."""
     counts, mixed = np.zeros(len(own), np.int64), np.zeros(len(own))
     for k in range(len(observers)):
+        if not (0 <= observers[k] < len(own) and 0 <= neighbors[k] < len(own)):
+            raise IndexError("observers and neighbors are numbers of vehicles, from 0")
         counts[observers[k]] += 1
         mixed[observers[k]] += own[neighbors[k]]
     for i in range(len(own)):

@@ -1,7 +1,7 @@
 """The observation by numba, whose numbers equal those of NumPy up to rounding.
 
 The inner loops are written in LLVM's vectors, which LLVM splits where they are longer than the processor's. numba's own loops
-over rows of 11 anchors take several times as long. All functions are in this file, as numba's cache notices no change in another.
+over rows of 11 anchors take several times as long. All functions are in one file: numba's cache does not depend on other files.
 """
 
 from __future__ import annotations

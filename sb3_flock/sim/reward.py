@@ -173,11 +173,14 @@ def mix_rewards(
     :param neighbors: ``(links,)``, number j of one of its neighbors
     :param lambda_: share of the own reward, in [0, 1]
     :return: the shape of ``rewards``
+    :raises IndexError: for a number that is not a vehicle's
     """
     own = np.asarray(rewards, dtype=np.float64).ravel()
     kernels = compiled()
     if kernels is not None:
         return kernels.mix_rewards(own, observers, neighbors, lambda_).reshape(np.shape(rewards))
+    if len(neighbors) and min(observers.min(), neighbors.min()) < 0:
+        raise IndexError("observers and neighbors are numbers of vehicles, from 0")
     count = np.bincount(observers, minlength=len(own))
     mean_of_neighbors = np.bincount(observers, own[neighbors], minlength=len(own)) / np.maximum(count, 1)
     return np.where(count > 0, lambda_ * own + (1 - lambda_) * mean_of_neighbors, own).reshape(np.shape(rewards))

@@ -34,6 +34,8 @@ from sb3_flock.config.training import TrainingConfig
 from sb3_flock.envs.vec_env import ParameterSharingVecEnv
 from sb3_flock.rl.buffers import load_replay_state, replay_state
 from sb3_flock.rl.compiled_update import compiled_kernels
+from sb3_flock.rl.ddpg import FlockTD3
+from sb3_flock.rl.registry import ALGORITHMS, uses_compact_buffer
 from sb3_flock.serialization.load import PolicyError, checkpoint_paths, first_line, read_member, read_tensors
 from sb3_flock.serialization.migrate import MEMBER, check_format, migrate_state
 from sb3_flock.serialization.save import save_model, versions
@@ -190,18 +192,24 @@ def runtime_info(config: TrainingConfig) -> dict[str, str]:
         "numba": version("numba") if compiled() else "none",
         "machine": f"{platform.system()} {platform.machine()} {th.backends.cpu.get_cpu_capability()}",
         "processor": _processor(),
-        "update": f"compiled, SciPy {version('scipy')}" if compiled_kernels() else "torch",
+        "update": _update(config),
         "device": get_device(config.device).type,
         "threads": str(th.get_num_threads()),
     }
 
 
+def _update(config: TrainingConfig) -> str:
+    """What code updates the networks."""
+    algorithm, _ = ALGORITHMS[config.algo].load()
+    is_compiled = issubclass(algorithm, FlockTD3) and uses_compact_buffer(config) and compiled_kernels()
+    return f"compiled, SciPy {version('scipy')}" if is_compiled and config.device == "cpu" else "torch"
+
+
 def _processor() -> str:
     """Vendor, family and model of the processor: libraries of linear algebra choose their code, and so their rounding, by it."""
+    names = "vendor_id|cpu family|model|CPU implementer|CPU part"
     try:
-        fields = dict(
-            re.findall(r"^(vendor_id|cpu family|model)\s*: (.+)$", Path("/proc/cpuinfo").read_text("utf-8"), re.MULTILINE)
-        )
+        fields = dict(re.findall(rf"^({names})\s*: (.+)$", Path("/proc/cpuinfo").read_text("utf-8"), re.MULTILINE))
     except OSError:
         fields = {}
     return " ".join(fields.values()) or platform.processor()

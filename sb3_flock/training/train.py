@@ -28,7 +28,6 @@ from sb3_flock.rl.callbacks import (
     StopOnNonFiniteLoss,
     StoreExecutedActions,
 )
-from sb3_flock.rl.compiled_update import cores
 from sb3_flock.rl.ddpg import FlockTD3
 from sb3_flock.rl.registry import build_model
 from sb3_flock.serialization.load import PolicyError, check_device, checkpoint_paths, load_policy
@@ -294,7 +293,8 @@ def _build(config: TrainingConfig, env: VecEnv) -> OffPolicyAlgorithm:
     except MemoryError:
         raise SettingsError(f"buffer_size = {config.algorithm.buffer_size}: more than this machine's memory") from None
     if isinstance(model, FlockTD3):
-        model.update_threads = config.torch_threads
+        may_use_two = cores() > 1 and os.environ.get("OMP_NUM_THREADS") != "1"
+        model.update_threads = config.torch_threads or (2 if may_use_two else 1)
     if config.init_from is not None:
         initial = load_policy(config.init_from)
         initial.check(config.scenario)
@@ -313,3 +313,8 @@ def _summary(config: TrainingConfig, model: OffPolicyAlgorithm, folder: Path) ->
         f"each; device {model.device}, "
         f"torch threads {th.get_num_threads()} on {cores()} cores; {folder}"
     )
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

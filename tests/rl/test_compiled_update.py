@@ -1,14 +1,18 @@
 """The weights of a model that is updated by compiled code are still torch's own."""
 
+import gc
+import threading
 from copy import deepcopy
 
+import numpy as np
 import pytest
 import torch as th
+from torch import nn
 
-from sb3_flock import make_vec_env
+from sb3_flock import CompactReplayBuffer, FlockCNN, make_vec_env
 from sb3_flock.rl import compiled_update
-from sb3_flock.rl.compiled_update import can_compile, cores, update_threads
-from sb3_flock.rl.ddpg import FlockDDPG
+from sb3_flock.rl.compiled_update import can_compile
+from sb3_flock.rl.ddpg import FlockDDPG, FlockTD3
 from sb3_flock.rl.policies import FlockPolicy
 from tests.rl.filled_models import filled, updated
 
@@ -59,20 +63,132 @@ def test_a_copy_of_a_model_is_updated_by_itself():
         assert th.equal(a, b)
 
 
-@pytest.mark.parametrize("change", ["weight_decay", "no fast extra", "another buffer"])
-def test_without_the_parts_torch_updates(monkeypatch, change):
+class Normed(FlockPolicy):
+    """Our policy with another actor."""
+
+    def make_actor(self, features_extractor=None):
+        actor = super().make_actor(features_extractor)
+        actor.mu = nn.Sequential(nn.LayerNorm(actor.features_dim), *actor.mu)
+        return actor
+
+
+class Elu(FlockCNN):
+    """Our extractor with another activation."""
+
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.dense[-1] = nn.ELU()
+
+
+class Shuffled(CompactReplayBuffer):
+    """Our buffer with another way to sample."""
+
+    def _get_samples(self, batch_inds, env=None):
+        return super()._get_samples(batch_inds[::-1], env)
+
+
+def model_with(policy=FlockPolicy, buffer=CompactReplayBuffer, **policy_kwargs):
+    env = make_vec_env(n_flocks=2, seed=0)
+    options = {"learning_starts": 600, "buffer_size": 600, "batch_size": 16, "device": "cpu"}
+    model = FlockTD3(policy, env, replay_buffer_class=buffer, policy_kwargs=policy_kwargs, **options)
+    model.learn(300)
+    model._update_current_progress_remaining(0, 1)
+    return model
+
+
+def test_our_own_parts_are_compiled():
+    assert can_compile(model_with())
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        {"activation_fn": nn.Tanh},
+        {"share_features_extractor": True},
+        {"policy": Normed},
+        {"features_extractor_class": Elu},
+        {"buffer": Shuffled},
+        {"buffer": None},
+        {"optimizer_class": th.optim.AdamW},
+        {"optimizer_kwargs": {"eps": 1e-3}},
+    ],
+    ids=str,
+)
+def test_with_other_parts_torch_updates(parts):
+    model = model_with(**parts)
+    assert not can_compile(model)
+    before = model.policy.state_dict()["critic.qf0.0.weight"].clone()
+    updated(model, 2)
+    assert not th.equal(before, model.policy.state_dict()["critic.qf0.0.weight"])
+
+
+def test_frozen_weights_stay_where_they_are():
+    model = model_with()
+    for network in (model.actor, model.critic):
+        network.features_extractor.requires_grad_(False)
+    assert not can_compile(model)
+
+
+def test_without_the_fast_extra_torch_updates(monkeypatch):
     model = filled()
-    if change == "weight_decay":
-        model.critic.optimizer.param_groups[0]["weight_decay"] = 0.1
-    elif change == "no fast extra":
-        monkeypatch.setattr(compiled_update, "compiled_kernels", lambda: None)
-    else:
-        model = FlockDDPG(FlockPolicy, make_vec_env(n_flocks=2, seed=0), learning_starts=600, batch_size=16, device="cpu")
-        model.learn(360)
+    monkeypatch.setattr(compiled_update, "compiled_kernels", lambda: None)
     assert not can_compile(model)
     before = model.policy.state_dict()["critic.qf0.0.weight"].clone()
     updated(model)
     assert not th.equal(before, model.policy.state_dict()["critic.qf0.0.weight"])
+
+
+def test_a_thread_that_fails_ends_the_other(monkeypatch):
+    """An interrupt of the main thread, or no memory in the second, must not leave a thread that waits for ever."""
+    from sb3_flock.rl import update_kernels
+
+    compiled, failing = update_kernels.update, []
+
+    def fails(thread, *arguments):
+        if thread in failing:
+            raise KeyboardInterrupt
+        compiled(thread, *arguments)
+
+    model = updated(filled(), 1)
+    model.update_threads = 2
+    monkeypatch.setattr(update_kernels, "update", fails)
+    threads = threading.active_count()
+    for thread in (0, 1):
+        failing[:] = [thread]
+        before = deepcopy(model.policy.state_dict())
+        with pytest.raises(KeyboardInterrupt):
+            updated(model, 5)
+        assert threading.active_count() == threads
+        assert all(th.equal(tensor, before[name]) for name, tensor in model.policy.state_dict().items())
+    monkeypatch.undo()
+    updated(model, 5)
+
+
+def test_the_update_holds_no_model():
+    """Else a model that is no longer used would keep its replay buffer until the next collection of garbage."""
+    model = updated(filled(), 1)
+    assert model not in vars(model._update).values()
+    assert not any(model is referent for referent in gc.get_referents(model._update))
+
+
+def test_a_replay_buffer_with_nan_ends_in_a_loss_that_is_nan():
+    model = filled()
+    model.replay_buffer.observations[:] = np.nan
+    updated(model, 2)
+    assert np.isnan(model.logger.name_to_value["train/critic_loss"])
+
+
+@pytest.mark.parametrize(
+    ("torch_threads", "update_threads", "expected"), [(1, 0, 1), (2, 0, 2), (4, 0, 2), (1, 2, 2), (4, 1, 1)]
+)
+def test_as_many_threads_as_torch_has_two_at_most(monkeypatch, torch_threads, update_threads, expected):
+    used = []
+    monkeypatch.setattr(compiled_update, "_run", lambda threads, *arguments: used.append(threads))
+    monkeypatch.setattr(th, "get_num_threads", lambda: torch_threads)
+    model = filled()
+    model.update_threads = update_threads
+    updated(model, 1)
+    assert used == [expected]
 
 
 def test_no_updates_change_nothing():
@@ -80,19 +196,3 @@ def test_no_updates_change_nothing():
     before = deepcopy(model.policy.state_dict())
     model.train(0, 16)
     assert all(th.equal(tensor, before[name]) for name, tensor in model.policy.state_dict().items())
-
-
-@pytest.mark.parametrize(
-    ("available", "omp", "wanted", "expected"),
-    [(1, None, 0, 1), (2, None, 0, 2), (8, "4", 0, 2), (8, "1", 0, 1), (8, "1", 2, 2), (1, None, 4, 2), (8, None, 1, 1)],
-)
-def test_two_threads_where_two_cores_may_be_used(monkeypatch, available, omp, wanted, expected):
-    monkeypatch.setattr(compiled_update, "cores", lambda: available)
-    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
-    if omp:
-        monkeypatch.setenv("OMP_NUM_THREADS", omp)
-    assert update_threads(wanted) == expected
-
-
-def test_this_process_may_use_a_core():
-    assert cores() >= 1

@@ -74,6 +74,7 @@ def test_a_not_finite_number_stays_one(rng):
     normed, scale, out = np.empty_like(z), np.empty(3, np.float32), np.empty_like(z)
     layers.norm_relu(z, bias, np.ones(4, np.float32), bias, normed, scale, out)
     assert np.isnan(scale).tolist() == [False, True, False]
+    assert np.isnan(normed[1]).all()
 
 
 def test_bounds(rng):
@@ -113,16 +114,15 @@ def test_patches_are_those_of_a_convolution(rng):
     near(gradient.reshape(4, side, side, channels).transpose(0, 3, 1, 2), leaf.grad)
 
 
-def test_every_finite_half_is_read_exactly():
+def test_every_half_is_read_exactly():
     bits = np.arange(1 << 16, dtype=np.uint16)
-    bits = bits[np.isfinite(bits.view(np.float16))]
     bits = bits[: len(bits) // 121 * 121].reshape(-1, 121)
     for half in bits:
         for is_mirrored in (False, True):
             image = np.empty(121, np.float32)
             layers.read_image(image, half, 1, 11, is_mirrored)
             expected = half.view(np.float16).astype(np.float32).reshape(11, 11)
-            assert np.array_equal(image.reshape(11, 11), expected[:, ::-1] if is_mirrored else expected)
+            np.testing.assert_array_equal(image.reshape(11, 11), expected[:, ::-1] if is_mirrored else expected)
 
 
 def test_an_image_has_its_channels_last(rng):

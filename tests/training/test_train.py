@@ -10,11 +10,11 @@ import torch as th
 
 from sb3_flock import evaluate, load_policy, train
 from sb3_flock.config.training import TrainingConfig
-from sb3_flock.rl.compiled_update import cores
 from sb3_flock.rl.registry import ALGORITHMS
 from sb3_flock.serialization.load import PolicyError
 from sb3_flock.serialization.yaml_io import load_config
 from sb3_flock.settings import UserError
+from sb3_flock.training.train import cores
 from tests.helpers import quiet, tiny
 
 
@@ -83,9 +83,25 @@ def test_the_best_model_is_the_one_with_the_lowest_score(tmp_path):
 
 @pytest.mark.parametrize(("threads", "batch_size", "expected"), [(0, 128, 1), (0, 1024, cores()), (2, 128, 2)])
 def test_torch_threads_follow_the_batch_and_the_cores_unless_given(tmp_path, threads, batch_size, expected):
-    result = train(tiny(tmp_path, torch_threads=threads, batch_size=batch_size, eval_freq=0, save_freq=0), quiet())
+    train(tiny(tmp_path, torch_threads=threads, batch_size=batch_size, eval_freq=0, save_freq=0), quiet())
     assert th.get_num_threads() == expected
-    assert result.model.update_threads == threads
+
+
+@pytest.mark.parametrize(
+    ("available", "omp", "threads", "expected"),
+    [(1, None, 0, 1), (2, None, 0, 2), (8, "4", 0, 2), (8, "1", 0, 1), (8, "1", 2, 2), (8, None, 1, 1)],
+)
+def test_the_update_has_two_threads_where_two_cores_may_be_used(tmp_path, monkeypatch, available, omp, threads, expected):
+    monkeypatch.setattr("sb3_flock.training.train.cores", lambda: available)
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    if omp:
+        monkeypatch.setenv("OMP_NUM_THREADS", omp)
+    config = tiny(tmp_path, torch_threads=threads, total_timesteps=30, eval_freq=0, save_freq=0)
+    assert train(config, quiet()).model.update_threads == expected
+
+
+def test_this_process_may_use_a_core():
+    assert cores() >= 1
 
 
 def test_one_seed_trains_the_same_policy_twice_and_another_a_different_one(tmp_path):
