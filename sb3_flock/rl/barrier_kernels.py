@@ -67,9 +67,10 @@ def wait_for_other(barrier: NDArray[np.int64], thread: int) -> bool:
     """
     arrivals = _load(barrier, thread) + 1  # type: ignore[call-arg]
     _store(barrier, thread, arrivals)
-    spins = 0
-    while _load(barrier, 1 - thread) < arrivals:
+    spins, theirs = 0, _load(barrier, 1 - thread)
+    while theirs < arrivals and theirs != ABORTED:
         spins += 1
         if spins > _SPINS:
             _yield_core()
-    return _load(barrier, 1 - thread) != ABORTED
+        theirs = _load(barrier, 1 - thread)
+    return theirs != ABORTED
