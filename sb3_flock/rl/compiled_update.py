@@ -6,10 +6,11 @@ optimizers' moments. Saving and loading need no change.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -97,7 +98,7 @@ class CompiledUpdate:
         target = self._flatten(f"{name}_target", getattr(model, f"{name}_target"))
         exp_avg, exp_avg_sq = self._flatten_moments(name, getattr(model, name))
         if name not in self._gradients:
-            self._gradients[name] = np.zeros((HALVES, len(online)), np.float32)
+            self._gradients[name] = th.zeros(HALVES, len(online)).numpy()
         return Network(online, exp_avg, exp_avg_sq, target, self._gradients[name])
 
     def _flatten(self, name: str, network: nn.Module) -> NDArray[np.float32]:
@@ -163,8 +164,6 @@ def _is_plain_adam(network: nn.Module) -> bool:
 def compiled_kernels() -> ModuleType | None:
     """:mod:`sb3_flock.rl.update_kernels`, or ``None`` where the ``fast`` extra is not installed."""
     try:
-        importlib.import_module("threadpoolctl")
-        importlib.import_module("scipy.linalg.cython_blas")  # loads the BLAS that numba uses
         return importlib.import_module("sb3_flock.rl.update_kernels")
     except (ImportError, RuntimeError):  # RuntimeError: there is no folder where numba may keep its cache
         return None
@@ -172,14 +171,18 @@ def compiled_kernels() -> ModuleType | None:
 
 _MOMENTS = ("exp_avg", "exp_avg_sq")
 _LOCK = threading.Lock()
-"""One round at a time: the number of BLAS's threads is the process's."""
+"""One round at a time: the number of torch's threads is the process's."""
 
 
-@functools.cache
-def _blas() -> Any:
-    from threadpoolctl import ThreadpoolController
-
-    return ThreadpoolController().select(user_api="blas")
+@contextlib.contextmanager
+def _one_torch_thread() -> Iterator[None]:
+    """Let torch's BLAS use one thread in each thread that calls it."""
+    before = th.get_num_threads()
+    th.set_num_threads(1)
+    try:
+        yield
+    finally:
+        th.set_num_threads(before)
 
 
 def _run(threads: int, *arguments: Any) -> None:
@@ -190,13 +193,14 @@ def _run(threads: int, *arguments: Any) -> None:
     barrier = new_barrier()
 
     def run(thread: int) -> None:
+        th.set_num_threads(1)
         try:
             update(thread, threads, barrier, *arguments)
         except BaseException:
             barrier[:] = ABORTED  # the other thread would wait for ever
             raise
 
-    with _LOCK, _blas().limit(limits=1):
+    with _LOCK, _one_torch_thread():
         if threads == 1:
             run(0)
             return
@@ -307,7 +311,7 @@ def _workspace(shapes: Shapes, n_actions: int) -> Workspace:
     hidden = max(sum(shapes.actor_widths), sum(shapes.critic_widths))
 
     def memory(numbers: int) -> NDArray[np.float32]:
-        return np.zeros((HALVES, numbers), np.float32)
+        return th.zeros(HALVES, numbers).numpy()
 
     return Workspace(
         images=memory(n * shapes.channels * shapes.side**2),

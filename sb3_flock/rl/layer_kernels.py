@@ -1,6 +1,6 @@
 """Layers of the networks, forward and backward, compiled by numba: twins of torch's layers, tested against them.
 
-Matrices are ``(rows, columns)`` float32 and contiguous. Matrix products go to BLAS; everything around a product is one loop.
+Matrices are ``(rows, columns)`` float32 and contiguous. Products go to BLAS (``blas_kernels``); all around a product is one loop.
 Images are channels last: the numbers under one row of a kernel stand side by side.
 """
 
@@ -17,47 +17,17 @@ Indices = NDArray[np.int64]
 
 ZERO, ONE = np.float32(0), np.float32(1)
 _NORM_EPSILON = np.float32(1e-5)
-_UNPACKED = 1_000_000
-"""Multiplications of the largest product that OpenBLAS does without packing its factors first, with AVX-512."""
 _SMALLEST_NORMAL_HALF = np.float32(2.0**-14)
 
 _kernel = njit(error_model="numpy", cache=True)
 """Without numba's ``fastmath``: with it a function rounds otherwise where it was compiled into another one, and a process that
-compiles ends at other bits than one that loads the cache. Sums over rows go to BLAS, sums over columns use the vector units."""
+compiles ends at other bits than one that loads the cache. Sums along a row are of 16 parts, for the vector units."""
 
 
 @_kernel
 def matrix(memory: Array, offset: int, rows: int, columns: int) -> Array:
     """A part of flat memory as a matrix."""
     return memory[offset : offset + rows * columns].reshape(rows, columns)
-
-
-@_kernel
-def product(a: Array, b: Array, out: Array) -> None:
-    """The product a b."""
-    np.dot(a, b, out)
-
-
-@_kernel
-def product_transposed(a: Array, b: Array, out: Array) -> None:
-    """The product a b^T."""
-    np.dot(a, b.T, out)
-
-
-@_kernel
-def transposed_product(a: Array, b: Array, out: Array) -> None:
-    """The product a^T b; tall matrices in blocks, of which each product is small enough for OpenBLAS to be fast."""
-    block = _UNPACKED // (a.shape[1] * b.shape[1])
-    if block < 128 or block >= len(a):
-        np.dot(a.T, b, out)
-        return
-    part = np.empty_like(out)
-    out[:] = 0
-    for start in range(0, len(a), block):
-        np.dot(a[start : start + block].T, b[start : start + block], part)
-        for i in range(out.shape[0]):
-            for j in range(out.shape[1]):
-                out[i, j] += part[i, j]
 
 
 @_kernel
@@ -94,20 +64,33 @@ def sum_rows(gradient: Array, out: Array) -> None:
 
 
 @_kernel
+def _sum(row: Array, parts: Array) -> np.float32:
+    """The sum of a row, of 16 parts, each for every 16th number."""
+    parts[:] = 0
+    whole = len(row) // 16 * 16
+    for start in range(0, whole, 16):
+        for lane in range(16):
+            parts[lane] += row[start + lane]
+    total = ZERO
+    for lane in range(16):
+        total += parts[lane]
+    for j in range(whole, len(row)):
+        total += row[j]
+    return total
+
+
+@_kernel
 def norm_relu(z: Array, bias: Array, weight: Array, norm_bias: Array, normed: Array, scale: Array, out: Array) -> None:
     """Bias, layer norm and ReLU; ``normed`` and ``scale`` are kept for the backward pass."""
     n, width = z.shape
-    share = np.full(width, ONE / np.float32(width))
-    mean, variance = np.empty(n, np.float32), np.empty(n, np.float32)
+    parts = np.empty(16, np.float32)
     add_bias(z, bias)
-    np.dot(z, share, mean)
     for i in range(n):
+        mean = _sum(z[i], parts) / np.float32(width)
         for j in range(width):
-            z[i, j] -= mean[i]
+            z[i, j] -= mean
             normed[i, j] = z[i, j] * z[i, j]
-    np.dot(normed, share, variance)
-    for i in range(n):
-        scale[i] = ONE / np.sqrt(variance[i] + _NORM_EPSILON)
+        scale[i] = ONE / np.sqrt(_sum(normed[i], parts) / np.float32(width) + _NORM_EPSILON)
         for j in range(width):
             normed[i, j] = z[i, j] * scale[i]
             out[i, j] = max(normed[i, j] * weight[j] + norm_bias[j], ZERO)
@@ -119,8 +102,7 @@ def norm_relu_backward(
 ) -> None:
     """The gradient in front of :func:`norm_relu`, in place, and those of its parameters."""
     n, width = out.shape
-    share = np.full(width, ONE / np.float32(width))
-    mean, product_mean, products = np.empty(n, np.float32), np.empty(n, np.float32), np.empty_like(out)
+    parts, products = np.empty(16, np.float32), np.empty(width, np.float32)
     relu_backward(gradient, out)
     sum_rows(gradient, d_norm_bias)
     d_weight[:] = 0
@@ -128,12 +110,10 @@ def norm_relu_backward(
         for j in range(width):
             d_weight[j] += gradient[i, j] * normed[i, j]
             gradient[i, j] *= weight[j]
-            products[i, j] = gradient[i, j] * normed[i, j]
-    np.dot(gradient, share, mean)
-    np.dot(products, share, product_mean)
-    for i in range(n):
+            products[j] = gradient[i, j] * normed[i, j]
+        mean, product_mean = _sum(gradient[i], parts) / np.float32(width), _sum(products, parts) / np.float32(width)
         for j in range(width):
-            gradient[i, j] = (gradient[i, j] - mean[i] - normed[i, j] * product_mean[i]) * scale[i]
+            gradient[i, j] = (gradient[i, j] - mean - normed[i, j] * product_mean) * scale[i]
 
 
 @_kernel

@@ -17,6 +17,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from sb3_flock.rl.barrier_kernels import wait_for_other
+from sb3_flock.rl.blas_kernels import product, product_transposed, transposed_product
 from sb3_flock.rl.layer_kernels import (
     ONE,
     ZERO,
@@ -31,15 +32,12 @@ from sb3_flock.rl.layer_kernels import (
     norm_relu,
     norm_relu_backward,
     polyak,
-    product,
-    product_transposed,
     read_image,
     relu_backward,
     scatter_patches,
     sum_rows,
     swap_inner,
     tanh_backward,
-    transposed_product,
 )
 
 HALVES = 2
@@ -619,5 +617,5 @@ def _cached_by(sources: int) -> Any:
     return update
 
 
-_OTHERS = ("barrier_kernels.py", "layer_kernels.py")
+_OTHERS = ("barrier_kernels.py", "blas_kernels.py", "layer_kernels.py")
 update = _cached_by(zlib.crc32(b"".join(Path(__file__).with_name(name).read_bytes() for name in _OTHERS)))

@@ -202,7 +202,7 @@ def _update(config: TrainingConfig) -> str:
     """What code updates the networks."""
     algorithm, _ = ALGORITHMS[config.algo].load()
     is_compiled = issubclass(algorithm, FlockTD3) and uses_compact_buffer(config) and compiled_kernels()
-    return f"compiled, SciPy {version('scipy')}" if is_compiled and config.device == "cpu" else "torch"
+    return "compiled" if is_compiled and config.device == "cpu" else "torch"
 
 
 def _processor() -> str:
