@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from sb3_flock.rl.compiled_update import HALVES, _shapes
-from sb3_flock.rl.layer_kernels import matrix, product, product_transposed, transposed_product
+from sb3_flock.rl.blas_kernels import product, product_transposed, transposed_product
+from sb3_flock.rl.compiled_update import _shapes
+from sb3_flock.rl.layer_kernels import matrix
+from sb3_flock.rl.update_kernels import HALVES
 
 FORWARD, DOWN, WEIGHTS = range(3)
 """x W^T; dy W; dy^T x."""

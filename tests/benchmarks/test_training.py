@@ -12,7 +12,6 @@ from stable_baselines3.common.logger import configure
 
 from sb3_flock import CompactReplayBuffer, FlockCNN, FlockDDPG, FlockPolicy, evaluate, load_policy, make_vec_env, train
 from sb3_flock.config.training import TrainingConfig
-from sb3_flock.rl import compiled_update
 from sb3_flock.rl.registry import policy_kwargs
 from sb3_flock.serialization.yaml_io import load_config
 from tests.benchmarks.conftest import POLICY
@@ -56,6 +55,7 @@ def untrained_model(kind, config, env):
         "replay_buffer_kwargs": {"mirror_augmentation": True, "store_expert_actions": kind.bc_coef > 0},
         "compiled": kind.compiled,
         "bc_coef": kind.bc_coef,
+        "update_threads": kind.threads,
     }
     model = kind.algorithm(
         FlockPolicy,
@@ -76,7 +76,7 @@ def untrained_model(kind, config, env):
 
 @pytest.mark.parametrize("batch_size", [128, 256])
 @pytest.mark.parametrize("shape", SHAPES)
-def test_updates(benchmark, monkeypatch, shape, batch_size):
+def test_updates(benchmark, shape, batch_size):
     """Rounds of updates of each kind in turn, so that other load of the machine affects all of them."""
     config = SHAPES[shape]
     scenario = config.training_scenarios()[0]
@@ -88,7 +88,6 @@ def test_updates(benchmark, monkeypatch, shape, batch_size):
 
     def one_round():
         for name, model in models.items():
-            monkeypatch.setattr(compiled_update, "update_threads", lambda name=name: kinds[name].threads)
             start = time.perf_counter()
             model.train(UPDATES, batch_size)
             seconds[name].append(time.perf_counter() - start)
@@ -106,12 +105,11 @@ def test_updates(benchmark, monkeypatch, shape, batch_size):
 
 @pytest.mark.parametrize("batch_size", [128, 256])
 @pytest.mark.parametrize("shape", SHAPES)
-def test_products_of_an_update(benchmark, monkeypatch, shape, batch_size):
+def test_products_of_an_update(benchmark, shape, batch_size):
     """The compiled update in one thread, and its matrix products alone, in turn: what limits it."""
     pytest.importorskip("numba")
     from tests.benchmarks.products import flops, memory_of, products_of, run_products
 
-    monkeypatch.setattr(compiled_update, "update_threads", lambda: 1)
     config = SHAPES[shape]
     model = untrained_model(Kind(), config, make_vec_env(config.training_scenarios()[0], 8, seed=0))
     model.train(1, batch_size)

@@ -195,8 +195,10 @@ def test_attributes_and_methods_of_the_copies_are_reachable_through_wrappers():
     assert env.get_attr("render_mode", indices=[0, 5]) == ["rgb_array"] * 2
     assert env.render_mode == "rgb_array"
     assert env.n_agents == 3
-    env.set_attr("marker", 1, indices=[4])
-    assert [getattr(copy, "marker", 0) for copy in env.get_attr("unwrapped", indices=[0, 3])] == [0, 1]
+    env.set_attr("marker", 1)
+    assert [copy.marker for copy in env.get_attr("unwrapped", indices=[0, 3])] == [1, 1]
+    with pytest.raises(NotImplementedError, match=r"set_attr\('marker'\): the copies share their attributes"):
+        env.set_attr("marker", 2, indices=[4])
     assert env.env_method("action_space", "vehicle_0", indices=0) == [env.action_space]
     assert env.env_is_wrapped(VecMonitor) == [False] * 6
     assert env.has_attr("scenario")
