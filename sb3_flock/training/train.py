@@ -28,6 +28,7 @@ from sb3_flock.rl.callbacks import (
     StopOnNonFiniteLoss,
     StoreExecutedActions,
 )
+from sb3_flock.rl.compiled_update import can_compile
 from sb3_flock.rl.ddpg import FlockTD3
 from sb3_flock.rl.registry import build_model
 from sb3_flock.serialization.load import PolicyError, check_device, checkpoint_paths, load_policy
@@ -307,11 +308,14 @@ def _build(config: TrainingConfig, env: VecEnv) -> OffPolicyAlgorithm:
 def _summary(config: TrainingConfig, model: OffPolicyAlgorithm, folder: Path) -> str:
     """What is trained, on what, where: one line."""
     scenarios = config.training_scenarios()
+    compiled = ""
+    if isinstance(model, FlockTD3) and can_compile(model):
+        compiled = f", of the compiled update {model.update_threads},"
     return (
         f"{config.algo} for {config.scenario.bodies}; training env: {config.n_flocks} flocks of "
         f"{' and of '.join(str(scenario.n_vehicles) for scenario in scenarios)} vehicles, {scenarios[0].n_obstacles} obstacles "
         f"each; device {model.device}, "
-        f"torch threads {th.get_num_threads()} on {cores()} cores; {folder}"
+        f"torch threads {th.get_num_threads()}{compiled} on {cores()} cores; {folder}"
     )
 
 
