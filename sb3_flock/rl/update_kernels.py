@@ -582,37 +582,9 @@ def _cached_by(sources: int) -> Any:
     """:func:`_update` for Python, cached. Numba's key for a function has its closure, and so a checksum of other files."""
 
     @njit(error_model="numpy", cache=True, nogil=True)
-    def update(
-        thread: int,
-        n_threads: int,
-        barrier: NDArray[np.int64],
-        shapes: Shapes,
-        actor: Network,
-        critic: Network,
-        replay: ReplayArrays,
-        batches: Batches,
-        hyper: Hyperparameters,
-        ws: Workspace,
-        steps: tuple[int, int],
-        updates_actor: NDArray[np.bool_],
-        losses: NDArray[np.float64],
-    ) -> None:
+    def update(*arguments: Any) -> None:
         if sources >= 0:  # always: a variable is in the closure only where it is used
-            _update(
-                thread,
-                n_threads,
-                barrier,
-                shapes,
-                actor,
-                critic,
-                replay,
-                batches,
-                hyper,
-                ws,
-                steps,
-                updates_actor,
-                losses,
-            )
+            _update(*arguments)
 
     return update
 
