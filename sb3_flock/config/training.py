@@ -13,7 +13,7 @@ from sb3_flock.rl.registry import ModelSettings
 from sb3_flock.rl.settings import Count, Width
 from sb3_flock.settings import NotNegative, Positive, Settings, suggest
 from sb3_flock.sim import Scenario
-from sb3_flock.sim.dynamics import MAX_BODIES
+from sb3_flock.sim.dynamics import MAX_BODIES, ObstacleMotion
 
 Sizes = Annotated[tuple[Width, ...], BeforeValidator(lambda value: (value,) if isinstance(value, int) else value)]
 """One or several; a number alone is one."""
@@ -36,9 +36,15 @@ class TrainEnvConfig(Settings):
         max_length=16,
         description="vehicles per flock, one or several sizes; null: as in the task (paper: null)",
     )
+    obstacle_motions: tuple[ObstacleMotion, ...] | None = Field(
+        None,
+        min_length=1,
+        max_length=2,
+        description="motions of the obstacles, each with flocks of its own; null: as in the task (paper: null)",
+    )
     extra_obstacles: int = Field(1, ge=0, le=MAX_BODIES, description="obstacles added if the task has any (paper: 0)")
     obstacle_arena_scale: Positive = Field(
-        0.5, description="factor on the obstacles' square, unless obstacle_starts is set (paper: 1)"
+        0.5, description="factor on the square of obstacles that walk, unless obstacle_starts is set (paper: 1)"
     )
     time_step_scale: Positive = Field(2.0, description="factor on the sampling period (paper: 1)")
     separation_scale: float = Field(1.06, ge=1, le=1e6, description="factor on the minimum separations (paper: 1)")
@@ -90,15 +96,21 @@ class TaskConfig(Settings):
             time_step=scenario.time_step * train_env.time_step_scale,
             max_cycles=max(1, round(scenario.max_cycles / train_env.time_step_scale)),
             n_obstacles=scenario.n_obstacles + (train_env.extra_obstacles if scenario.n_obstacles else 0),
-            obstacle_arena=scenario.obstacle_half_side
-            * (1.0 if scenario.obstacle_starts else train_env.obstacle_arena_scale),
             neighbor_separation=min(scenario.neighbor_separation * train_env.separation_scale, scenario.link_range),
             obstacle_separation=min(
                 scenario.obstacle_separation * (train_env.obstacle_separation_scale or train_env.separation_scale),
                 scenario.detection_range,
             ),
         )
-        return [changed.replace(n_vehicles=size) for size in train_env.flock_sizes or (scenario.n_vehicles,)]
+        # Crossing obstacles meet the flock where it gathers: their square stays as it is.
+        narrow = scenario.obstacle_half_side * (1.0 if scenario.obstacle_starts else train_env.obstacle_arena_scale)
+        arenas = {"walk": narrow, "crossing": scenario.obstacle_half_side}
+        motions = [
+            changed.replace(obstacle_motion=motion, obstacle_arena=arenas[motion])
+            for motion in train_env.obstacle_motions or (scenario.obstacle_motion,)
+        ]
+        sizes = train_env.flock_sizes or (scenario.n_vehicles,)
+        return [motion.replace(n_vehicles=size) for motion in motions for size in sizes]
 
 
 class TrainingConfig(ModelSettings, TaskConfig):

@@ -62,7 +62,7 @@ class MPC(Controller):
 
     def __init__(self, world: World, config: MPCConfig | None = None) -> None:
         try:
-            from sb3_flock.controllers.mpc_kernels import UNIT_LINK, CostParams, optimize
+            from sb3_flock.controllers.mpc_kernels import UNIT_LINK, CostParams, FilterParams, optimize
         except (ImportError, RuntimeError) as error:  # RuntimeError: as in sb3_flock.sim.backend
             raise SettingsError(f"expert = 'mpc': needs numba, pip install 'sb3_flock[fast]' ({error})") from None
         self.world, self.config, self._optimize = world, config or MPCConfig(), optimize
@@ -76,6 +76,12 @@ class MPC(Controller):
             self.config.separation_weight,
             self.config.clearance_weight,
             self.config.link_weight,
+        )
+        level = scenario.safety_filter
+        self._filter = FilterParams(
+            (scenario.neighbor_separation + scenario.safety_margin) / self._unit,
+            {"off": 0, "announce": 2}.get(level, 1),
+            level != "voronoi",
         )
 
     def act(self, sensing: Sensing, scenario: Scenario) -> Array:
@@ -93,7 +99,9 @@ class MPC(Controller):
             state = positions[flock], world.headings[flock]
             predicted = np.ascontiguousarray(obstacles[flock][:, visible[flock]])
             optimizer = config.n_iterations, config.step_size
-            self._optimize(plan, *state, waypoints[flock], predicted, max_step, max_turn, self._cost, *optimizer)
+            self._optimize(
+                plan, *state, waypoints[flock], predicted, max_step, max_turn, self._cost, self._filter, *optimizer
+            )
         return plans[:, :, 0] * world.action_high
 
 

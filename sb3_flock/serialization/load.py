@@ -78,6 +78,7 @@ class LoadedPolicy:
         names = (
             "link_range",
             "detection_range",
+            "shared_detections",
             "channel_radii",
             "extra_channels",
             "anchor_width",

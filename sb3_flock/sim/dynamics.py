@@ -13,6 +13,8 @@ from sb3_flock.settings import NotNegative, Positive, Settings
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+ObstacleMotion = Literal["walk", "crossing"]
+
 MAX_BODIES = 1_000_000
 """Largest number of vehicles or obstacles. Each body adds at most 1 to an anchor, so this also bounds the observation."""
 
@@ -31,7 +33,7 @@ class DynamicsSettings(Settings):
     obstacle_turn_std: NotNegative = Field(
         2.0, description="standard deviation of an obstacle's turn rate, drawn each step [rad/s] (paper: not stated)"
     )
-    obstacle_motion: Literal["walk", "crossing"] = Field(
+    obstacle_motion: ObstacleMotion = Field(
         "walk",
         description="walk: random walk; crossing: straight through the flock from its far side (paper: walk)",
     )

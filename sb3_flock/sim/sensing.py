@@ -29,6 +29,10 @@ class SensingSettings(Settings):
     neighbor_separation: NotNegative = Field(0.1, description="minimum separation to neighbors r_n' [m] (paper: 0.1)")
     detection_range: Positive = Field(0.25, description="obstacle detection range r_o [m] (paper: 0.25)")
     obstacle_separation: NotNegative = Field(0.15, description="minimum separation to obstacles r_o' [m] (paper: 0.15)")
+    shared_detections: bool = Field(
+        False,
+        description="neighbors tell each other by communication where the obstacles are that they detect (paper: false)",
+    )
 
     @model_validator(mode="after")
     def _ranges_fit(self) -> SensingSettings:
@@ -36,6 +40,11 @@ class SensingSettings(Settings):
             if getattr(self, near) > getattr(self, far):
                 raise ValueError(f"{near} = {getattr(self, near)}: input should be at most {far} = {getattr(self, far)}")
         return self
+
+    @property
+    def known_obstacle_range(self) -> float:
+        """Distance within which every obstacle lies that a vehicle detects or is told of [m]."""
+        return self.detection_range + (self.link_range if self.shared_detections else 0.0)
 
 
 @dataclass(frozen=True)
@@ -97,7 +106,7 @@ class Sensing:
     neighbors: Contacts
     """The proximity graph: d_ij < r_n."""
     obstacles: Contacts
-    """Detected obstacles: d_io < r_o."""
+    """Detected obstacles, d_io < r_o, and with ``shared_detections`` those that a neighbor detects."""
     waypoint_positions: NDArray[np.float64]
     """``(flocks, vehicles, 2)``."""
     waypoint_distances: NDArray[np.float64]
@@ -146,15 +155,48 @@ def sense(
     kernels = compiled() if max(positions.shape[1], obstacle_positions.shape[1]) <= _FEW else None
     if kernels is not None:
         sensed = kernels.sense(positions, frames, obstacle_positions, waypoints, link_range, detection_range)
-        return Sensing(Contacts(shape, *sensed[0]), Contacts(shape, *sensed[1]), sensed[2], sensed[3], ego_motion)
-    offsets = waypoints[:, None, :] - positions
-    return Sensing(
-        neighbors=find_contacts(positions, frames, positions, link_range, exclude_self=True),
-        obstacles=find_contacts(positions, frames, obstacle_positions, detection_range),
-        waypoint_positions=_to_body(offsets, frames),
-        waypoint_distances=_norm(offsets),
-        ego_motion=ego_motion,
+        sensing = Sensing(Contacts(shape, *sensed[0]), Contacts(shape, *sensed[1]), sensed[2], sensed[3], ego_motion)
+    else:
+        offsets = waypoints[:, None, :] - positions
+        sensing = Sensing(
+            neighbors=find_contacts(positions, frames, positions, link_range, exclude_self=True),
+            obstacles=find_contacts(positions, frames, obstacle_positions, detection_range),
+            waypoint_positions=_to_body(offsets, frames),
+            waypoint_distances=_norm(offsets),
+            ego_motion=ego_motion,
+        )
+    if not ranges.shared_detections:
+        return sensing
+    shared = share_detections(sensing.neighbors, sensing.obstacles, positions, frames, obstacle_positions)
+    return replace(sensing, obstacles=shared)
+
+
+def share_detections(
+    neighbors: Contacts,
+    detected: Contacts,
+    positions: NDArray[np.float64],
+    frames: NDArray[np.float64],
+    obstacle_positions: NDArray[np.float64],
+) -> Contacts:
+    """The obstacles that each vehicle or one of its neighbors detects.
+
+    :param neighbors: the proximity graph
+    :param detected: the obstacles that the vehicles detect themselves
+    :param positions: of the vehicles, ``(flocks, vehicles, 2)`` [m]
+    :param frames: cosine and sine of their headings, ``(flocks, vehicles, 2)``
+    :param obstacle_positions: ``(flocks, obstacles, 2)`` [m]
+    """
+    n_obstacles, counts = obstacle_positions.shape[1], detected.count().ravel()
+    told = counts[neighbors.vehicles]  # how many obstacles each neighbor tells of
+    first = np.repeat((np.cumsum(counts) - counts)[neighbors.vehicles] - (np.cumsum(told) - told), told)
+    bodies = detected.bodies[first + np.arange(len(first))]
+    observers = np.concatenate((detected.observers, np.repeat(neighbors.observers, told)))
+    observers, bodies = np.divmod(
+        np.unique(observers * n_obstacles + np.concatenate((detected.bodies, bodies))), n_obstacles
     )
+    flocks = observers // positions.shape[1]
+    offsets = obstacle_positions[flocks, bodies] - positions.reshape(-1, 2)[observers]
+    return Contacts(detected.shape, observers, bodies, _to_body(offsets, frames.reshape(-1, 2)[observers]), _norm(offsets))
 
 
 def compensate_ego_motion(positions: NDArray[np.float64], ego_motion: NDArray[np.float64]) -> NDArray[np.float64]:

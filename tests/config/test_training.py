@@ -44,6 +44,19 @@ def test_obstacles_with_given_starts_keep_their_square():
     assert load_config(TrainingConfig, overrides={"obstacle_arena": 2.0}).training_scenarios()[0].obstacle_arena == 1.0
 
 
+def test_each_motion_of_the_obstacles_has_flocks_of_its_own_and_crossing_obstacles_keep_their_square():
+    overrides = {"obstacle_arena": 2.0, "train_env.flock_sizes": [3, 5], "train_env.obstacle_motions": ["walk", "crossing"]}
+    changed = load_config(TrainingConfig, overrides=overrides).training_scenarios()
+    assert [(env.obstacle_motion, env.n_vehicles, env.obstacle_arena) for env in changed] == [
+        ("walk", 3, 1.0),
+        ("walk", 5, 1.0),
+        ("crossing", 3, 2.0),
+        ("crossing", 5, 2.0),
+    ]
+    (alone,) = load_config(TrainingConfig, overrides={"obstacle_motion": "crossing"}).training_scenarios()
+    assert (alone.obstacle_motion, alone.obstacle_arena) == ("crossing", 1.0)
+
+
 def test_with_every_change_switched_off_the_training_env_is_the_task():
     train_env = TrainEnvConfig(
         flock_sizes=None, extra_obstacles=0, obstacle_arena_scale=1.0, time_step_scale=1.0, separation_scale=1.0

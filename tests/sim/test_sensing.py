@@ -107,3 +107,45 @@ def test_distances_come_in_blocks_and_the_nearest_is_the_smallest(monkeypatch):
 )
 def test_connectivity_of_chains_and_islands(links, n, connected):
     np.testing.assert_array_equal(is_connected(graph(links, n, flocks=2)), [connected, connected])
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("seed", range(5))
+def test_neighbors_tell_each_other_of_the_obstacles_that_they_detect(seed, compiled, monkeypatch):
+    if not compiled:
+        monkeypatch.setattr(sensing, "compiled", lambda *names: None)
+    rng, task = np.random.default_rng(seed), Scenario(n_vehicles=6, n_obstacles=3, neighbor_separation=0.01)
+    world = World(task, 4)
+    world.reset([np.random.default_rng(flock) for flock in range(4)])
+    world.positions, world.obstacle_positions = rng.uniform(-0.15, 0.15, (4, 6, 2)), rng.uniform(-0.4, 0.4, (4, 3, 2))
+    alone = world.sense()
+    world.scenario = task.replace(shared_detections=True)
+    together = world.sense()
+
+    def known(contacts):
+        rows = zip(contacts.observers.tolist(), contacts.bodies.tolist(), strict=True)
+        return dict(zip(rows, np.column_stack((contacts.positions, contacts.distances)).tolist(), strict=True))
+
+    own, told = known(alone.obstacles), known(together.obstacles)
+    links = list(zip(alone.neighbors.observers.tolist(), alone.neighbors.vehicles.tolist(), strict=True))
+    expected = {*own, *((i, body) for i, j in links for vehicle, body in own if vehicle == j)}
+    assert list(told) == sorted(expected)
+    assert len(own) < len(told) < 4 * 6 * 3
+    assert own.items() <= told.items()  # what a vehicle detects itself stays as it is, to the last bit
+    assert all(row[2] < world.scenario.known_obstacle_range for row in told.values())
+    for (i, body), (x, y, distance) in told.items():
+        flock, vehicle = divmod(i, 6)
+        offset = world.obstacle_positions[flock, body] - world.positions[flock, vehicle]
+        cos, sin = world.frames[flock, vehicle]
+        np.testing.assert_allclose((cos * x - sin * y, sin * x + cos * y), offset, atol=1e-12)
+        assert distance == pytest.approx(np.hypot(*offset))
+    np.testing.assert_array_equal(together.neighbors.distances, alone.neighbors.distances)
+
+
+def test_with_shared_detections_an_obstacle_that_nobody_detects_is_unknown():
+    world = World(Scenario(n_vehicles=2, n_obstacles=1, shared_detections=True))
+    world.reset([np.random.default_rng(0)])
+    world.positions, world.obstacle_positions = np.array([[[0.0, 0.0], [0.12, 0.0]]]), np.array([[[0.38, 0.0]]])
+    assert len(world.sense().obstacles.observers) == 0
+    world.obstacle_positions = np.array([[[0.36, 0.0]]])
+    assert world.sense().obstacles.observers.tolist() == [0, 1]
