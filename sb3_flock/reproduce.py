@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,15 +13,14 @@ import numpy as np
 from rich.console import Console
 
 from sb3_flock.config.training import TrainingConfig
-from sb3_flock.controllers import CONTROLLERS, make_controller
+from sb3_flock.controllers import CONTROLLERS, Controller, make_controller
 from sb3_flock.envs.vec_env import make_vec_env
 from sb3_flock.evaluation import robustness
-from sb3_flock.evaluation.metrics import METRICS, Metric, columns
+from sb3_flock.evaluation.metrics import METRICS, EpisodeMetric, Metric, columns
 from sb3_flock.evaluation.model_cards import median_of_seeds, read_card
 from sb3_flock.evaluation.report import PAPER
 from sb3_flock.evaluation.robustness import evaluate_with_errors
 from sb3_flock.evaluation.rollout import evaluate
-from sb3_flock.pretrained import shipped_policies
 from sb3_flock.rl.callbacks import NeighborInclusiveReward
 from sb3_flock.rl.registry import build_model
 from sb3_flock.serialization.load import LoadedPolicy, load_policy
@@ -30,24 +29,62 @@ from sb3_flock.settings import SettingsError
 from sb3_flock.sim import Scenario
 from sb3_flock.viz.figures import check_matplotlib, plot_lines, plot_observation, plot_trajectories, record_trajectory, save
 
-SETTINGS = {
-    "ddpg-3v1o": Scenario(n_vehicles=3, n_obstacles=1),
-    "ddpg-5v1o": Scenario(n_vehicles=5, n_obstacles=1),
-    "ddpg-5v2o": Scenario(n_vehicles=5, n_obstacles=2),
+EXPERIMENTS = {
+    "3v1o": Scenario(n_vehicles=3, n_obstacles=1),
+    "5v1o": Scenario(n_vehicles=5, n_obstacles=1),
+    "5v2o": Scenario(n_vehicles=5, n_obstacles=2),
 }
-"""The paper's experiments by the name of their shipped `ddpg` policy."""
+"""The paper's experiments by name, a table each."""
 
-KINDS = {"ddpg (the paper's observation)": "ddpg-", "ddpg-bc (motion channels, expert)": "ddpg-bc-"}
-"""The kinds of shipped policies by the label of their rows, with the first part of their names."""
+CROSSING = {"5v2o-crossing": Scenario(n_vehicles=5, n_obstacles=2, obstacle_motion="crossing")}
+"""The tasks with obstacles that cross the flock by name, a table each."""
 
-CROSSING = "crossing-5v2o"
-"""The policy trained for obstacles that cross the flock."""
+TASKS = {**EXPERIMENTS, **CROSSING}
 
-TRAINED = "ddpg-bc, trained for crossing obstacles"
-"""The label of its row."""
+FILTERS = ("off", "announce")
+"""The safety filters with which each controller is evaluated, a row each."""
+
+
+@dataclass(frozen=True)
+class Rows:
+    """A shipped policy or a baseline controller in the tables, with each of the filters."""
+
+    name: str
+    note: str = ""
+    """What stands behind its name."""
+    tasks: tuple[str, ...] = tuple(TASKS)
+    """The tables it is in."""
+    filters: tuple[str, ...] = FILTERS
+
+
+_PAPER_OBSERVATION, _EXPERT = "the paper's observation", "motion channels, expert"
+
+ROWS = (
+    Rows("ddpg-3v1o", _PAPER_OBSERVATION, tasks=("3v1o",)),
+    Rows("ddpg-5v1o", _PAPER_OBSERVATION, tasks=("5v1o",)),
+    Rows("ddpg-5v2o", _PAPER_OBSERVATION, tasks=("5v2o", "5v2o-crossing")),
+    Rows("ddpg-bc-3v1o", _EXPERT, tasks=("3v1o",)),
+    Rows("ddpg-bc-5v1o", _EXPERT, tasks=("5v1o",)),
+    Rows("ddpg-bc-5v2o", _EXPERT, tasks=("5v2o", "5v2o-crossing")),
+    Rows("crossing-5v2o", f"{_EXPERT}, trained for crossing obstacles", tasks=("5v2o-crossing",)),
+    Rows("olfati-saber"),
+    Rows("orca"),
+    Rows("random", filters=("off",)),
+    Rows("go-to-waypoint", filters=("off",)),
+)
+"""The rows of the tables: each name is a shipped policy's or a controller's."""
+
+SHOWN = "ddpg-5v2o"
+"""The policy of the figures of one episode and of the sensor errors."""
+
+ANY_SIZE = "general"
+"""The policy that is evaluated with many flock sizes."""
+
+CURVES = ("ddpg-3v1o", "ddpg-5v1o", "ddpg-5v2o")
+"""The policies whose training curves are drawn."""
 
 FLOCK_SIZES = (1, 2, 3, 5, 8, 12, 20, 50, 200)
-"""Numbers of vehicles with which the policy `general` is evaluated."""
+"""Numbers of vehicles with which :data:`ANY_SIZE` is evaluated."""
 
 _MOST_IN_THE_ARENA = 50
 """Number of vehicles that start in the paper's arena and leave room for obstacles."""
@@ -61,8 +98,15 @@ COLUMNS = {
     "neighbor violations": "neighbor_violation_rate",
     "obstacle violations": "obstacle_violation_rate",
     "connected": "connectivity",
+    "free": "violation_free_rate",
+    "success": "success_rate",
 }
 """The metrics of the tables by their headings."""
+
+_ABOUT_ANNOUNCE = (
+    "The filter `announce` needs communication: in each step every vehicle sends its heading and one number, the speed that it "
+    "will reach at least, to its neighbors."
+)
 
 
 @dataclass(frozen=True)
@@ -92,15 +136,16 @@ def reproduce(out: str | Path, quick: bool = False, console: Console | None = No
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise SettingsError(f"{out}: {error.strerror or error}") from None
-    policies = {name: load_policy(name) for name in shipped_policies()}
-    tables: dict[str, dict[str, dict[str, Metric]]] = {}
+    names = {row.name for row in ROWS if row.name not in CONTROLLERS} | {SHOWN, ANY_SIZE, *CURVES}
+    policies = {name: load_policy(name) for name in names}
+    tables: dict[str, dict[str, dict[str, dict[str, Metric]]]] = {}
     sections: dict[str, Callable[[], str]] = {
-        "tables I and II": lambda: _tables(tables, policies, size.episodes),
-        "crossing obstacles": lambda: _crossing(policies, size.episodes),
-        "figures": lambda: _episode_figures(folder, policies["ddpg-5v2o"]),
-        "training curves": lambda: _training_curve(folder),
-        "one policy with 1 to 200 vehicles": lambda: _flock_sizes(folder, policies["general"], size.flock_size_episodes),
-        "sensor errors": lambda: _sensors(policies["ddpg-5v2o"], size.episodes // 4 or 1),
+        "tables I and II": lambda: _experiments(tables, policies, size.episodes),
+        "crossing obstacles": lambda: _crossing(tables, policies, size.episodes),
+        "figures": lambda: _episode_figures(folder, policies[SHOWN]),
+        "training curves": lambda: _training_curve(folder, policies),
+        "one policy with 1 to 200 vehicles": lambda: _flock_sizes(folder, policies[ANY_SIZE], size.flock_size_episodes),
+        "sensor errors": lambda: _sensors(policies[SHOWN], size.episodes // 4 or 1),
         "time of training against the number of vehicles": lambda: _training_time(folder, size.timed_steps),
     }
     parts = [_head(size)]
@@ -118,80 +163,91 @@ def _head(size: Size) -> str:
     return (
         "# The paper's tables and figures beside the results of this package\n\n"
         f"{size.episodes} episodes a row (seed 0), distances in meters, steady-state values as `docs/paper_deviations.md` "
-        f"defines them. Made by `sb3-flock reproduce` with {packages}."
+        "defines them. In a free episode no vehicle violates any separation. Free episodes and successes have their 95 % "
+        f"intervals in parentheses. `docs/safety.md` describes the filters. Made by `sb3-flock reproduce` with {packages}."
     )
 
 
-def _policies_for(name: str) -> dict[str, str]:
-    """The names of the shipped policies for an experiment of :data:`SETTINGS`, by label."""
-    return {label: name.replace("ddpg-", kind) for label, kind in KINDS.items()}
-
-
-def _evaluate_all(policies: Mapping[str, LoadedPolicy], scenario: Scenario, episodes: int) -> dict[str, dict[str, Metric]]:
-    """The metrics of the policies, by label, and of every baseline controller that is installed."""
-    rows = {
-        label: evaluate(policy, scenario.replace(motion_lag=policy.scenario.motion_lag), episodes, seed=0)
-        for label, policy in policies.items()
-    }
-    for name in CONTROLLERS:
-        try:
-            controller = make_controller(name)
-        except SettingsError:  # its library is not installed: the row is left out
-            continue
-        rows[name] = evaluate(controller, scenario, episodes, seed=0)
-    return rows
-
-
-def _tables(tables: dict[str, Any], policies: Mapping[str, LoadedPolicy], episodes: int) -> str:
+def _experiments(tables: dict[str, Any], policies: Mapping[str, LoadedPolicy], episodes: int) -> str:
     """Tables I and II with the rows of this package; the metrics go into ``tables``."""
     parts = ["## Tables I and II"]
-    for name, scenario in SETTINGS.items():
-        shipped = _policies_for(name)
-        tables[name] = _evaluate_all({label: policies[own] for label, own in shipped.items()}, scenario, episodes)
-        names = " and ".join(f"`{own}`" for own in shipped.values())
-        lines = [f"{scenario.bodies} ({names}):\n", *_header()]
-        for table, figures in PAPER[scenario.n_vehicles, scenario.n_obstacles].items():
-            lines.append(_row(f"paper, {table}", figures))
-        for label, own in shipped.items():
-            card = read_card(own)
-            lines.append(
-                _row(f"{label}, median of {len(card['seeds'])} trainings, from the model card", median_of_seeds(card))
-            )
-        parts.append("\n".join([*lines, *_rows(tables[name])]))
+    for task, scenario in EXPERIMENTS.items():
+        figures = PAPER[scenario.n_vehicles, scenario.n_obstacles].items()
+        paper = [_row(f"paper, {table}", "", _without_intervals(means)) for table, means in figures]
+        parts.append(_table(f"{scenario.bodies}:", [*paper, *_rows(tables, task, policies, episodes)]))
     return "\n\n".join(parts)
 
 
-def _crossing(policies: Mapping[str, LoadedPolicy], episodes: int) -> str:
-    others = _policies_for("ddpg-5v2o")
-    labeled = {TRAINED: policies[CROSSING], **{label: policies[name] for label, name in others.items()}}
-    lines = [
-        "## A hard test: obstacles that cross the flock\n",
-        f"5 vehicles, 2 obstacles, `--obstacle-motion crossing` (`{CROSSING}` is trained for crossing obstacles, "
-        f"{' and '.join(f'`{name}`' for name in others.values())} are not):\n",
-        *_header(),
-    ]
-    return "\n".join([*lines, *_rows(_evaluate_all(labeled, policies[CROSSING].scenario, episodes))])
+def _crossing(tables: dict[str, Any], policies: Mapping[str, LoadedPolicy], episodes: int) -> str:
+    parts = ["## A hard test: obstacles that cross the flock"]
+    for task, scenario in CROSSING.items():
+        caption = f"{scenario.bodies}, `--obstacle-motion crossing`:"
+        parts.append(_table(caption, _rows(tables, task, policies, episodes)))
+    return "\n\n".join(parts)
 
 
-def _rows(rows: Mapping[str, Mapping[str, Metric]]) -> list[str]:
-    labels = {label: f"{label}, the shipped policy" for label in (*KINDS, TRAINED)}
-    return [_row(labels.get(name, f"`{name}`"), _means(metrics)) for name, metrics in rows.items()]
+def _rows(tables: dict[str, Any], task: str, policies: Mapping[str, LoadedPolicy], episodes: int) -> list[str]:
+    """The rows of a task: medians over the trainings of its own policies, then what :data:`ROWS` says."""
+    scenario, medians, evaluated = TASKS[task], [], []
+    tables[task] = {}
+    for rows in ROWS:
+        if task not in rows.tasks:
+            continue
+        label = f"`{rows.name}`" + (f" ({rows.note})" if rows.note else "")
+        if rows.name in policies:
+            medians += _median(label, rows.name, policies[rows.name].scenario, scenario)
+        tables[task][rows.name] = found = _evaluate(rows, policies, scenario, episodes)
+        evaluated += [_row(label, f"`{safety_filter}`", metrics) for safety_filter, metrics in found.items()]
+    return medians + evaluated
 
 
-def _means(metrics: Mapping[str, Metric]) -> dict[str, float | None]:
-    return {name: metric.mean for name, metric in metrics.items()}
+def _median(label: str, name: str, trained_for: Scenario, scenario: Scenario) -> list[str]:
+    """A row with the median over the trainings of a policy, if there are several, and they were for this task."""
+    card = read_card(name)
+    bodies = ("n_vehicles", "n_obstacles", "obstacle_motion")
+    if len(card["seeds"]) == 1 or any(getattr(trained_for, field) != getattr(scenario, field) for field in bodies):
+        return []
+    label += f", median of {len(card['seeds'])} trainings, from the model card"
+    return [_row(label, f"`{trained_for.safety_filter}`", _without_intervals(median_of_seeds(card)))]
 
 
-def _header() -> list[str]:
-    return ["| | " + " | ".join(COLUMNS) + " |", "|---" * (len(COLUMNS) + 1) + "|"]
+def _evaluate(
+    rows: Rows, policies: Mapping[str, LoadedPolicy], scenario: Scenario, episodes: int
+) -> dict[str, dict[str, Metric]]:
+    """The metrics by safety filter; none for a controller whose library is not installed."""
+    controller: LoadedPolicy | Controller
+    if rows.name in policies:
+        controller = policies[rows.name]
+        scenario = scenario.replace(motion_lag=controller.scenario.motion_lag)
+    else:
+        try:
+            controller = make_controller(rows.name)
+        except SettingsError:
+            return {}
+    return {name: evaluate(controller, scenario.replace(safety_filter=name), episodes, seed=0) for name in rows.filters}
 
 
-def _row(label: str, values: Mapping[str, float | None]) -> str:
-    cells = []
-    for name in COLUMNS.values():
-        value = values.get(name)
-        cells.append("" if value is None else f"{100 * value:.2f} %" if METRICS[name].is_rate else f"{value:.3f}")
-    return f"| {label} | " + " | ".join(cells) + " |"
+def _table(caption: str, rows: Sequence[str]) -> str:
+    header = ["| | filter | " + " | ".join(COLUMNS) + " |", "|---" * (len(COLUMNS) + 2) + "|"]
+    return "\n".join([caption, "", *header, *rows, "", _ABOUT_ANNOUNCE])
+
+
+def _without_intervals(means: Mapping[str, float]) -> dict[str, Metric]:
+    return {name: Metric(mean, None, None, 0) for name, mean in means.items()}
+
+
+def _row(label: str, safety_filter: str, metrics: Mapping[str, Metric]) -> str:
+    cells = [_cell(METRICS[name], metrics.get(name)) for name in COLUMNS.values()]
+    return f"| {label} | {safety_filter} | " + " | ".join(cells) + " |"
+
+
+def _cell(kind: type[EpisodeMetric], metric: Metric | None) -> str:
+    if metric is None or metric.mean is None:
+        return ""
+    if not kind.is_binary:
+        return f"{100 * metric.mean:.2f} %" if kind.is_rate else f"{metric.mean:.3f}"
+    interval = "" if metric.low is None or metric.high is None else f" ({100 * metric.low:.1f} to {100 * metric.high:.1f})"
+    return f"{100 * metric.mean:.1f} %{interval}"
 
 
 def _episode_figures(folder: Path, policy: LoadedPolicy) -> str:
@@ -203,46 +259,51 @@ def _episode_figures(folder: Path, policy: LoadedPolicy) -> str:
     )
 
 
-def _training_curve(folder: Path) -> str:
+def _training_curve(folder: Path, policies: Mapping[str, LoadedPolicy]) -> str:
     """The return of the evaluations during the trainings of the model cards, against flock episodes of the training env."""
     series = {}
-    for name, scenario in SETTINGS.items():
-        seeds = read_card(name)["seeds"]
-        flock = load_policy(name).config.training_scenarios()[0]
+    for name in CURVES:
+        seeds, config = read_card(name)["seeds"], policies[name].config
+        flock = config.training_scenarios()[0]
         episodes = np.array(seeds[0]["curve"]["timesteps"]) / (flock.n_vehicles * flock.max_cycles)
         returns = np.array([seed["curve"]["return"] for seed in seeds])
-        series[scenario.bodies] = (episodes, returns)
+        series[config.scenario.bodies] = (episodes, returns)
     save(plot_lines(series, "flock episodes in training", "return of a vehicle, 100 episodes"), folder / "training")
     return (
-        "## Training curves\n\n![return against episodes](training.png)\n\nThe line is the median over the trainings, the "
+        "## Training curves\n\n![return against episodes](training.png)\n\n"
+        f"The trainings of {', '.join(f'`{name}`' for name in CURVES)}: the line is the median over the trainings, the "
         "shade covers all of them. The paper's policy was stable after about 10 000 episodes."
     )
 
 
 def _flock_sizes(folder: Path, policy: LoadedPolicy, episodes: int) -> str:
     """One policy with more and more vehicles; most of these flock sizes were not in its training."""
-    rows = {}
+    drawn = policy.scenario.safety_filter
+    rows, drawn_rows = [], []
     for n in FLOCK_SIZES:
         arena = max(1.0, (n / _MOST_IN_THE_ARENA) ** 0.5)
         cycles = round(policy.scenario.max_cycles * arena)
-        scenario = policy.scenario.replace(n_vehicles=n, arena=arena, max_cycles=cycles)
-        rows[n] = _means(evaluate(policy, scenario, max(1, episodes // max(1, n // 20)), seed=0))
+        for name in dict.fromkeys((*FILTERS, drawn)):
+            scenario = policy.scenario.replace(n_vehicles=n, arena=arena, max_cycles=cycles, safety_filter=name)
+            metrics = evaluate(policy, scenario, max(1, episodes // max(1, n // 20)), seed=0)
+            rows.append(_row(f"{n} vehicle{'s' * (n > 1)}", f"`{name}`", metrics))
+            if name == drawn:
+                drawn_rows.append({key: metric.mean for key, metric in metrics.items()})
     series = {
-        "tracking error [m]": [row["tracking_error"] for row in rows.values()],
+        "tracking error [m]": [row["tracking_error"] for row in drawn_rows],
         "least possible tracking error [m]": [densest_tracking(n) for n in FLOCK_SIZES],
-        "vehicle-steps with a neighbor violation": [row["neighbor_violation_rate"] or 0.0 for row in rows.values()],
-        "share not connected": [1 - (row["connectivity"] or 0.0) for row in rows.values()],
+        "vehicle-steps with a neighbor violation": [row["neighbor_violation_rate"] or 0.0 for row in drawn_rows],
+        "share not connected": [1 - (row["connectivity"] or 0.0) for row in drawn_rows],
     }
     curves = {label: (FLOCK_SIZES, np.array(values)) for label, values in series.items()}
     save(plot_lines(curves, "vehicles", "meters or share", log_x=True), folder / "flock_sizes")
-    lines = [
-        "## One policy, any number of vehicles\n",
-        f"`general`, 2 obstacles; beyond {_MOST_IN_THE_ARENA} vehicles arena and time grow, so that all find a start.\n",
-        *_header(),
-        *(_row(f"{n} vehicle{'s' * (n > 1)}", row) for n, row in rows.items()),
-        "\n![metrics against vehicles](flock_sizes.png)",
-    ]
-    return "\n".join(lines)
+    caption = (
+        f"`{ANY_SIZE}`, {policy.scenario.n_obstacles} obstacles; beyond {_MOST_IN_THE_ARENA} vehicles arena and time grow, so "
+        f"that all find a start. The figure shows the filter `{drawn}`, with which the policy was trained."
+    )
+    return "\n\n".join(
+        ["## One policy, any number of vehicles", _table(caption, rows), "![metrics against vehicles](flock_sizes.png)"]
+    )
 
 
 def _sensors(policy: LoadedPolicy, episodes: int) -> str:
@@ -250,7 +311,8 @@ def _sensors(policy: LoadedPolicy, episodes: int) -> str:
     headings = list(columns().values())
     lines = [
         "## Sensor errors\n",
-        f"`ddpg-5v2o`, trained without errors; {episodes} episodes a row (`sb3-flock evaluate ddpg-5v2o --sensors`):\n",
+        f"`{SHOWN}`, trained without errors, filter `{policy.scenario.safety_filter}`; {episodes} episodes a row "
+        f"(`sb3-flock evaluate {SHOWN} --sensors`):\n",
         "| sensor errors | " + " | ".join(headings) + " |",
         "|---" * (len(headings) + 1) + "|",
         *(f"| {name} | " + " | ".join(robustness.cells(row)) + " |" for name, row in rows.items()),

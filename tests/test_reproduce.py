@@ -1,11 +1,28 @@
 import json
+import re
 
 import pytest
 
 from sb3_flock import reproduce as module
 from sb3_flock.cli import main
+from sb3_flock.controllers import CONTROLLERS
+from sb3_flock.evaluation.model_cards import read_card
 from sb3_flock.evaluation.report import PAPER
-from sb3_flock.reproduce import COLUMNS, FLOCK_SIZES, KINDS, SETTINGS, TRAINED, Size, densest_tracking
+from sb3_flock.pretrained import shipped_policies
+from sb3_flock.reproduce import (
+    ANY_SIZE,
+    COLUMNS,
+    CROSSING,
+    CURVES,
+    EXPERIMENTS,
+    FILTERS,
+    FLOCK_SIZES,
+    ROWS,
+    SHOWN,
+    TASKS,
+    Size,
+    densest_tracking,
+)
 
 
 @pytest.fixture(scope="module")
@@ -18,40 +35,101 @@ def results(tmp_path_factory):
     return folder
 
 
-def test_every_table_and_figure_is_written_and_linked(results):
+@pytest.fixture(scope="module")
+def tables(results):
+    """The cells of every row by the heading of its section, without the headings' rows."""
+    found = {}
+    for section in (results / "results.md").read_text().split("\n## ")[1:]:
+        title, *lines = section.splitlines()
+        rows = [line for line in lines if line.startswith("| ") and not line.startswith("| |")]
+        found[title] = [[cell.strip() for cell in row.removeprefix("|").removesuffix("|").split("|")] for row in rows]
+    return found
+
+
+def test_every_figure_is_written_and_linked(results):
     page = (results / "results.md").read_text()
     for stem in ("trajectories", "observation", "training", "flock_sizes", "training_time"):
         assert f"({stem}.png)" in page
         assert (results / f"{stem}.png").stat().st_size > 10_000
         assert (results / f"{stem}.svg").stat().st_size > 5_000
-    rows = [line for line in page.splitlines() if line.startswith("| ")]
-    for name, scenario in SETTINGS.items():
-        assert f"{scenario.bodies} (`{name}` and `{name.replace('ddpg', 'ddpg-bc')}`)" in page
-        for figures in PAPER[scenario.n_vehicles, scenario.n_obstacles].values():
-            assert any(f"{figures['tracking_error']:.3f}" in row and "paper" in row for row in rows)
-    for label in (
-        "`random`",
-        "`go-to-waypoint`",
-        "`olfati-saber`",
-        "`orca`",
-        *(f"{kind}, the shipped policy" for kind in KINDS),
-    ):
-        assert sum(row.startswith(f"| {label} |") for row in rows) == len(SETTINGS) + 1  # and the crossing obstacles
-    assert sum(row.startswith(f"| {TRAINED}, the shipped policy |") for row in rows) == 1
-    assert sum(", median of 3 trainings, from the model card |" in row for row in rows) == len(SETTINGS) * len(KINDS)
+
+
+def test_the_rows_name_what_is_shipped_and_every_shipped_policy_has_its_own():
+    assert all(set(rows.tasks) <= set(TASKS) and rows.filters for rows in ROWS)
+    names = {rows.name for rows in ROWS} | {SHOWN, ANY_SIZE, *CURVES}
+    assert names - set(CONTROLLERS) == set(shipped_policies())
+    assert {"orca", "olfati-saber"} <= {rows.name for rows in ROWS if rows.tasks == tuple(TASKS)}
+
+
+def test_every_controller_is_in_every_table_of_its_tasks_with_each_filter(results, tables):
+    page = (results / "results.md").read_text()
+    experiments, crossing = tables["Tables I and II"], tables["A hard test: obstacles that cross the flock"]
+    for rows in ROWS:
+        for section, of_section in ((experiments, EXPERIMENTS), (crossing, CROSSING)):
+            shown = [row[1] for row in section if row[0].startswith(f"`{rows.name}`") and "median" not in row[0]]
+            assert shown == [f"`{name}`" for task in rows.tasks if task in of_section for name in rows.filters]
+    for scenario in EXPERIMENTS.values():
+        assert f"{scenario.bodies}:\n\n| | filter | tracking error | " in page
+        for table, figures in PAPER[scenario.n_vehicles, scenario.n_obstacles].items():
+            assert [f"paper, {table}", "", f"{figures['tracking_error']:.3f}"] in [row[:3] for row in experiments]
     assert "`--obstacle-motion crossing`" in page
-    assert sum(row.startswith(("| noise of ", "| delay of ")) for row in rows) == 8
-    assert sum(row.split(" | ")[0] in {f"| {n} vehicle{'s' * (n > 1)}" for n in FLOCK_SIZES} for row in rows) == len(
-        FLOCK_SIZES
-    )
+    assert page.count("The filter `announce` needs communication") == len(TASKS) + 1  # and one policy with many vehicles
+
+
+def test_a_policy_with_several_trainings_has_their_median_in_the_table_of_its_task(tables):
+    cards = {name: read_card(name) for name in shipped_policies()}
+    expected = [
+        (
+            rows.name,
+            len(cards[rows.name]["seeds"]),
+            f"`{cards[rows.name]['config']['scenario'].get('safety_filter', 'off')}`",
+        )
+        for task, scenario in EXPERIMENTS.items()
+        for rows in ROWS
+        if task in rows.tasks and rows.name in cards and cards[rows.name]["task"] == f"{scenario.bodies} (walk)"
+    ]
+    medians = [row[:2] for row in tables["Tables I and II"] if row[0].endswith(" trainings, from the model card")]
+    words = [(label.split("`")[1], int(re.search(r"median of (\d+)", label)[1]), of) for label, of in medians]
+    assert words == [row for row in expected if row[1] > 1]
+    assert len(words) >= 3
+
+
+def test_free_and_success_have_their_intervals(tables):
+    for title, rows in tables.items():
+        if title in {"Sensor errors", "Time of training"}:
+            continue
+        for label, _, *cells in rows:
+            assert len(cells) == len(COLUMNS)
+            if "paper, Table" in label or "median" in label:
+                assert "(" not in "".join(cells)
+            else:
+                assert all(re.fullmatch(r"[\d.]+ % \([\d.]+ to [\d.]+\)", cell) for cell in cells[-2:]), label
+
+
+def test_with_the_filter_no_separation_to_neighbors_is_violated(tables):
+    violations = list(COLUMNS).index("neighbor violations") + 2
+    filtered = [row for rows in tables.values() for row in rows if row[1] == "`announce`"]
+    assert len(filtered) > 20
+    assert {row[violations] for row in filtered} <= {"0.00 %", ""}  # "": a single vehicle
+
+
+def test_flock_sizes_and_sensor_errors_have_a_row_each(tables):
+    sizes = [row[:2] for row in tables["One policy, any number of vehicles"]]
+    assert sizes == [[f"{n} vehicle{'s' * (n > 1)}", f"`{name}`"] for n in FLOCK_SIZES for name in FILTERS]
+    errors = [row[0] for row in tables["Sensor errors"]]
+    assert sum(name.startswith(("noise of ", "delay of ")) for name in errors) == 8
 
 
 def test_the_tables_are_written_as_json(results):
     tables = json.loads((results / "tables.json").read_text())
-    assert set(tables) == set(SETTINGS)
-    for rows in tables.values():
-        assert all(set(rows[kind]) >= set(COLUMNS.values()) for kind in KINDS)
-        assert rows["go-to-waypoint"]["tracking_error"]["mean"] < 0.01
+    assert set(tables) == set(TASKS)
+    for task, table in tables.items():
+        assert list(table) == [rows.name for rows in ROWS if task in rows.tasks]
+        for rows in ROWS:
+            for metrics in table.get(rows.name, {}).values():
+                assert set(metrics) >= set(COLUMNS.values())
+        assert list(table["orca"]) == list(FILTERS)
+        assert table["go-to-waypoint"]["off"]["tracking_error"]["mean"] < 0.01
 
 
 def test_a_folder_that_cannot_be_created_is_an_error_of_one_line(capsys, tmp_path):

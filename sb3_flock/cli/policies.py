@@ -58,23 +58,20 @@ def _list() -> Table:
     """A line for each policy; the metrics are of the training that was shipped."""
     from rich.table import Table
 
-    from sb3_flock.evaluation.metrics import columns
     from sb3_flock.evaluation.model_cards import read_card
-    from sb3_flock.evaluation.report import short_cells
+    from sb3_flock.evaluation.report import add_short_columns, short_cells
     from sb3_flock.pretrained import shipped_policies
 
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
     for heading in ("name", "task", "method"):
-        table.add_column(heading, no_wrap=True)
-    for heading in columns().values():
-        table.add_column(heading.replace(" ", "\n"), justify="right")
-    table.add_column("size", justify="right", no_wrap=True)
-    for name, path in shipped_policies().items():
+        table.add_column(heading, no_wrap=heading != "task")
+    add_short_columns(table)
+    for name in shipped_policies():
         card = read_card(name)
         config = _config(card)
         scenario = config.scenario
         task = f"{scenario.n_vehicles}v{scenario.n_obstacles}o {scenario.obstacle_motion}"
-        table.add_row(name, task, _method(config)[0], *short_cells(_shipped(card)["metrics"]), _size(path.stat().st_size))
+        table.add_row(name, task, _method(config)[0], *short_cells(_shipped(card)["metrics"]))
     return table
 
 
@@ -104,10 +101,6 @@ def _method(config: TrainingConfig) -> tuple[str, str]:
     return f"RL+{name}", words
 
 
-def _size(n_bytes: int) -> str:
-    return f"{n_bytes / 1e6:.1f} MB"
-
-
 def _print_card(name: str, console: Any) -> None:
     from sb3_flock.evaluation.metrics import METRICS
     from sb3_flock.evaluation.model_cards import median_of_seeds, read_card
@@ -125,7 +118,7 @@ def _print_card(name: str, console: Any) -> None:
         "command": shipped["command"],
         "with": listed(f"{package} {version}" for package, version in card["versions"].items()),
         "trainings": f"{number}, which differ in the seed; the policy is that of seed {card['shipped_seed']}",
-        "file": f"{path.name}, {_size(path.stat().st_size)}",
+        "file": f"{path.name}, {path.stat().st_size / 1e6:.1f} MB",
     }
     grid = plain_table()
     grid.show_header = False

@@ -25,6 +25,7 @@ CONFIG_FLAGS: dict[str, tuple[tuple[str, ...], str]] = {
     "total_timesteps": (("-n", "--total-timesteps", "--n-timesteps"), "N"),
     "seed": (("--seed",), "N"),
     "algo": (("--algo",), "NAME"),
+    "train_env.expert": (("--expert",), "NAME"),
     "n_flocks": (("--n-flocks",), "N"),
     "device": (("--device",), "NAME"),
     "output_dir": (("-f", "--output-dir", "--log-folder"), "DIR"),
@@ -66,26 +67,36 @@ def add_config_flags(parser: Parser) -> None:
 
 def _help(path: str) -> str:
     """A field's own description and default; more for the fields that need it."""
+    from sb3_flock.config.presets import EXPERT_PRESETS
     from sb3_flock.config.training import TrainEnvConfig, TrainingConfig
+    from sb3_flock.controllers import EXPERTS
     from sb3_flock.rl.registry import ALGORITHMS
 
     field = field_of(TrainingConfig, path)
     text, _, null = (field.description or "").partition("; null: ")
     if path == "algo":
         text = f"learning algorithm: {listed(ALGORITHMS)}"
+    elif path == "train_env.expert":
+        presets = listed(EXPERT_PRESETS)
+        text = f"expert to learn from: {listed(EXPERTS)}; {presets} also sets what such a training needs (`sb3-flock config "
+        text += (
+            f"--expert {presets}` shows it), unless the config file or other flags do; the others set train_env.expert alone"
+        )
     elif path == "scenario.n_vehicles":
         sizes = listed(map(str, TrainEnvConfig().flock_sizes or ()))
         text = f"number of vehicles of the task (paper: 3 or 5); the training env has flocks of {sizes}, unless "
-        text += "--set train_env.flock_sizes=null"
+        text += "--expert mpc or --set train_env.flock_sizes=null"
     return f"{text} [{null if field.default is None else field.default}]".replace("%", "%%")
 
 
 def config_of(options: argparse.Namespace) -> Any:
-    """The training config that the flags make."""
+    """The training config that the flags make; the preset of ``--expert`` gives way to the file and all other flags."""
+    from sb3_flock.config.presets import EXPERT_PRESETS
     from sb3_flock.config.training import TrainingConfig
     from sb3_flock.serialization.yaml_io import load_config
 
-    return load_config(TrainingConfig, options.config, _overrides_of(options))
+    preset = EXPERT_PRESETS.get(getattr(options, "train_env.expert"))
+    return load_config(TrainingConfig, options.config, _overrides_of(options), defaults=preset)
 
 
 def _overrides_of(options: argparse.Namespace) -> dict[str, Any]:

@@ -14,6 +14,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import count
+from statistics import NormalDist
 from typing import ClassVar, Literal, TypeVar
 
 import numpy as np
@@ -102,6 +104,8 @@ class EpisodeMetric(ABC):
     description: ClassVar[str]
     is_rate: ClassVar[bool] = False
     """Whether it is a fraction, which tables show in percent."""
+    is_binary: ClassVar[bool] = False
+    """Whether it is 0 or 1 in each episode, so that its mean is a share of the episodes."""
     is_minimum: ClassVar[bool] = False
     """Whether it is a smallest distance; its worst episode is reported too."""
     column: ClassVar[str | None] = None
@@ -284,7 +288,7 @@ class MeanSeparationLinked(_Mean):
 class ObstacleViolationRate(_Mean):
     """Share of vehicle-steps that violate the separation to obstacles."""
 
-    name, better, is_rate, column = "obstacle_violation_rate", "lower", True, "obstacle viol."
+    name, better, is_rate, column = "obstacle_violation_rate", "lower", True, "obst. viol."
     description = "share of vehicle-steps with an obstacle closer than its minimum separation"
     steady_state_only = False
 
@@ -299,7 +303,7 @@ class ObstacleViolationRate(_Mean):
 class NeighborViolationRate(_Mean):
     """Share of vehicle-steps that violate the separation to neighbors."""
 
-    name, better, is_rate, column = "neighbor_violation_rate", "lower", True, "neighbor viol."
+    name, better, is_rate, column = "neighbor_violation_rate", "lower", True, "neigh. viol."
     description = "share of vehicle-steps with a vehicle closer than its minimum separation"
     steady_state_only = False
 
@@ -325,24 +329,55 @@ class Connectivity(_Mean):
 
 
 @register_metric
-class SuccessRate(EpisodeMetric):
-    """Share of episodes without any violation that end connected at the waypoint."""
+class ViolationFreeRate(EpisodeMetric):
+    """Share of episodes without any violation."""
 
-    name, better, is_rate = "success_rate", "higher", True
-    description = "share of episodes without violation that end connected, each vehicle within link range of the waypoint"
+    name, better, is_rate, is_binary = "violation_free_rate", "higher", True, True
+    column: ClassVar[str | None] = "free"
+    description = "share of episodes in which no vehicle violates any separation in any step"
 
     def __init__(self, scenario: Scenario, n_flocks: int) -> None:
         super().__init__(scenario, n_flocks)
-        self._violated, self._arrived = np.zeros(n_flocks, dtype=bool), np.zeros(n_flocks, dtype=bool)
+        self._violated = np.zeros(n_flocks, dtype=bool)
 
     def update(self, step: Step) -> None:
         self._violated |= (step.neighbor_violations > 0) | (step.obstacle_violations > 0)
-        if step.is_steady_state:
-            near = (step.sensing.waypoint_distances < self.scenario.link_range).all(-1)
-            self._arrived = step.connected & near
 
     def result(self) -> Values:
-        return (self._arrived & ~self._violated).astype(np.float64)
+        return (~self._violated).astype(np.float64)
+
+
+def lattice_rings(n_vehicles: int) -> int:
+    """Number of rings of a hexagonal lattice around the waypoint that holds all n vehicles.
+
+    It is the least k from 1 on with 1 + 3k(k + 1) >= n: 1 for up to 7 vehicles, 2 for 19, 3 for 37. With links as long as the
+    lattice's edges, no vehicle has to be farther than k link ranges from the waypoint.
+    """
+    return next(k for k in count(1) if 1 + 3 * k * (k + 1) >= n_vehicles)
+
+
+@register_metric
+class SuccessRate(ViolationFreeRate):
+    """Share of episodes without any violation that end connected, within :func:`lattice_rings` link ranges of the waypoint."""
+
+    name, column = "success_rate", "success"
+    description = (
+        "share of episodes without violation that end connected, each vehicle within k link ranges of the waypoint "
+        "(k: rings of a hexagonal lattice that holds all vehicles, 1 for up to 7)"
+    )
+
+    def __init__(self, scenario: Scenario, n_flocks: int) -> None:
+        super().__init__(scenario, n_flocks)
+        self._arrived = np.zeros(n_flocks, dtype=bool)
+        self._radius = lattice_rings(scenario.n_vehicles) * scenario.link_range
+
+    def update(self, step: Step) -> None:
+        super().update(step)
+        if step.is_steady_state:
+            self._arrived = step.connected & (step.sensing.waypoint_distances < self._radius).all(-1)
+
+    def result(self) -> Values:
+        return self._arrived * super().result()
 
 
 @register_metric
@@ -410,16 +445,39 @@ class Metric:
 
 
 def summarize(values: Mapping[str, Values]) -> dict[str, Metric]:
-    """Unweighted means over episodes, with 95 % percentile bootstrap intervals over episodes (10 000 resamples).
+    """Unweighted means over episodes, with 95 % intervals.
+
+    Metrics that are 0 or 1 in each episode (:attr:`EpisodeMetric.is_binary`) have Wilson's score interval, the others the
+    percentile bootstrap over episodes (10 000 resamples), which would have no width where all episodes are alike.
 
     :param values: one value per episode for each metric, NaN where undefined
     """
-    return {name: _summarize(name, per_episode[~np.isnan(per_episode)]) for name, per_episode in values.items()}
+    return {name: _summarize(METRICS[name], per_episode[~np.isnan(per_episode)]) for name, per_episode in values.items()}
 
 
-def _summarize(name: str, defined: Values) -> Metric:
+def _summarize(metric: type[EpisodeMetric], defined: Values) -> Metric:
     if len(defined) == 0:
         return Metric(None, None, None, 0)
+    mean = float(defined.mean())
+    low, high = wilson_interval(mean, len(defined)) if metric.is_binary else _bootstrap_interval(defined)
+    worst = float(defined.min()) if metric.is_minimum else None
+    return Metric(mean, low, high, len(defined), worst)
+
+
+def wilson_interval(share: float, n: int) -> tuple[float, float]:
+    """The 95 % score interval of a share of ``n`` episodes: every p from which the share is at most z standard errors away.
+
+    E. B. Wilson: *Probable inference, the law of succession, and statistical inference*, JASA 22 (1927), 209-212.
+    """
+    z = NormalDist().inv_cdf((1 + _CONFIDENCE) / 2)
+    center = share + z**2 / (2 * n)
+    half_width = z * (share * (1 - share) / n + (z / (2 * n)) ** 2) ** 0.5
+    scale = 1 + z**2 / n
+    low, high = (center - half_width) / scale, (center + half_width) / scale
+    return max(0.0, min(share, low)), min(1.0, max(share, high))  # exactly 0 and 1, where rounding leaves nearly that
+
+
+def _bootstrap_interval(defined: Values) -> tuple[float, float]:
     rng = np.random.default_rng(0)
     rows = max(1, 1_000_000 // len(defined))  # resamples drawn at once, to bound memory
     means = np.concatenate(
@@ -430,8 +488,7 @@ def _summarize(name: str, defined: Values) -> Metric:
     )
     tail = 50 * (1 - _CONFIDENCE)
     low, high = np.percentile(means, [tail, 100 - tail])
-    worst = float(defined.min()) if METRICS[name].is_minimum else None
-    return Metric(float(defined.mean()), float(low), float(high), len(defined), worst)
+    return float(low), float(high)
 
 
 def columns() -> dict[str, str]:

@@ -31,9 +31,9 @@ def read_card(name: str) -> dict[str, Any]:
 
 
 def median_of_seeds(card: dict[str, Any]) -> dict[str, float]:
-    """The median of each recorded metric over the trainings."""
+    """The median of each metric that is recorded of all trainings."""
     seeds = [seed["metrics"] for seed in card["seeds"]]
-    columns = {name: [metrics[name] for metrics in seeds] for name in seeds[0]}
+    columns = {name: [metrics.get(name) for metrics in seeds] for name in seeds[0]}
     return {name: float(np.median(values)) for name, values in columns.items() if None not in values}
 
 

@@ -50,9 +50,9 @@ PAPER: dict[tuple[int, int], dict[str, dict[str, float]]] = {
 """The figures of Lyu et al. (2018) by (vehicles, obstacles), table and metric; both tables have (3, 1), and differ there."""
 
 
-def plain_table() -> Table:
-    """An empty table in the package's style."""
-    return Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+def plain_table(gap: int = 2) -> Table:
+    """An empty table in the package's style, with so many characters between its columns."""
+    return Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, gap - 1, 0, 0))
 
 
 def add_short_columns(table: Table) -> None:
@@ -77,7 +77,7 @@ def metrics_table(metrics: dict[str, Metric], scenario: Scenario) -> Table:
     paper = PAPER.get((scenario.n_vehicles, scenario.n_obstacles), {})
     table = plain_table()
     table.add_column("metric", no_wrap=True)
-    for heading in ("mean", "95 % interval", "worst", *(f"paper {name.removeprefix('Table ')}" for name in paper)):
+    for heading in ("mean", "95 % interval", "worst", *(name.replace("Table ", "paper\n") for name in paper)):
         table.add_column(heading, justify="right", no_wrap=True)
     for name, kind in METRICS.items():
         metric = metrics[name]

@@ -38,7 +38,7 @@ def cells(row: dict[str, Metric]) -> list[str]:
 
 def errors_table(rows: dict[str, dict[str, Metric]]) -> Table:
     """The metrics under each error, one row each."""
-    table = plain_table()
+    table = plain_table(gap=1)
     table.add_column("sensor errors", no_wrap=True)
     add_short_columns(table)
     for name, row in rows.items():

@@ -44,25 +44,35 @@ def load_config(
     path: str | Path | None = None,
     overrides: Mapping[str, Any] | None = None,
     base: _Settings | None = None,
+    defaults: Mapping[str, Any] | None = None,
 ) -> _Settings:
     """A config from a YAML file, from another config or from the defaults, with overrides applied.
 
     :param path: YAML file; keys it leaves out keep their defaults
     :param base: the config to start from, instead of a file
     :param overrides: values by parameter name, leading groups may be left out (``reward.lambda_``)
+    :param defaults: values by parameter name for the keys that the file leaves out
     :raises SettingsError: one line for a file or a value that is not accepted
     """
     values: dict[str, Any] = {} if base is None else base.model_dump()
     if path is not None:
         values = _migrated(settings, read_yaml(Path(path)), Path(path))
     check_groups(settings, values)
+    for key, value in (defaults or {}).items():
+        level, name = _place_of(settings, key, values)
+        level.setdefault(name, value)
     for key, value in (overrides or {}).items():
-        *groups, name = resolve_path(settings, key)
-        level = values
-        for group in groups:
-            level = level.setdefault(group, {})
+        level, name = _place_of(settings, key, values)
         level[name] = value
     return settings(**values)
+
+
+def _place_of(settings: type[Settings], key: str, values: dict[str, Any]) -> tuple[dict[str, Any], str]:
+    """The group in a config's values that holds a parameter, made if it is missing, and the parameter's own name."""
+    *groups, name = resolve_path(settings, key)
+    for group in groups:
+        values = values.setdefault(group, {})
+    return values, name
 
 
 def parse_overrides(assignments: Iterable[str]) -> dict[str, Any]:

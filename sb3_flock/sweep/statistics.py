@@ -82,7 +82,7 @@ def report(config: SweepConfig, trials: Sequence[Trial], out: str) -> list[Table
 def trials_table(config: SweepConfig, trials: Sequence[Trial]) -> Table:
     """The metrics of each trial, one line each."""
     keys = [*(config.grid or config.search)]
-    table = plain_table()
+    table = plain_table(gap=1)
     for key in keys:
         table.add_column(key.split(".")[-1], overflow="fold")
     add_short_columns(table)

@@ -81,9 +81,10 @@ class TrialsTable(tune.Callback):
         self._live.update(Group(self._table(trials), Text(summary)))
 
     def _table(self, trials: list[Any]) -> Table:
-        table = plain_table()
-        others = sum(2 + max(map(len, heading.split())) for heading in ("running", "done", *columns().values()))
-        table.add_column("trial", no_wrap=True, overflow="ellipsis", max_width=max(12, self.console.width - others - 3))
+        table = plain_table(gap=1)
+        widths = [max(map(len, ["100.00%", *heading.split()])) for heading in columns().values()]
+        others = sum(1 + width for width in (len("running"), len("done"), *widths))
+        table.add_column("trial", no_wrap=True, overflow="ellipsis", max_width=max(12, self.console.width - others - 2))
         for heading in ("state", "done"):
             table.add_column(heading, justify="right", no_wrap=True)
         add_short_columns(table)

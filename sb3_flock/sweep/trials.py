@@ -108,7 +108,8 @@ class Reports(BaseCallback):
         evaluated = history.stat().st_mtime_ns if history.exists() else 0
         if evaluated != seen[1]:
             with np.load(history, allow_pickle=False) as curves:
-                self.row.update({name: float(curves[name][-1]) for name in columns()})
+                # A run that an earlier version began may lack a metric until its next evaluation.
+                self.row.update({name: float(curves[name][-1]) for name in columns() if name in curves})
                 self.row.update(score=float(curves["score"].min()), minutes=float(curves["seconds"][-1]) / 60)
         return saved[0] if saved else None, evaluated
 

@@ -86,7 +86,8 @@ class FlockEvalCallback(BaseCallback):
         current = score(means)
         for name, mean in {**means, "score": current}.items():
             self.logger.record(f"eval/{name}", mean)
-            self._history.setdefault(name, []).append(mean)
+            missing = [np.nan] * len(self._history["timesteps"])  # of a metric that came after the run began
+            self._history.setdefault(name, missing).append(mean)
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         self._log_trajectory(recorder)
         self._last = self.num_timesteps

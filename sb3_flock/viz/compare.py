@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from rich.table import Table
 
 from sb3_flock.config.training import TrainingConfig
-from sb3_flock.evaluation.metrics import columns
+from sb3_flock.evaluation.metrics import METRICS, columns
 from sb3_flock.evaluation.report import add_short_columns, plain_table, short_cells
 from sb3_flock.serialization.yaml_io import load_config
 from sb3_flock.settings import SettingsError, leaf_paths
@@ -24,13 +24,6 @@ from sb3_flock.viz.figures import LINE_STYLES, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-_TITLES = {
-    "tracking_error": "tracking error [m]",
-    "connectivity": "share of steady-state steps connected",
-    "neighbor_violation_rate": "share of vehicle-steps with a neighbor violation",
-    "obstacle_violation_rate": "share of vehicle-steps with an obstacle violation",
-}
 
 
 @dataclass(frozen=True)
@@ -86,7 +79,7 @@ def _shortest_names(paths: Sequence[str]) -> list[str]:
 
 def results_table(runs: Sequence[Run]) -> Table:
     """The best evaluation of each run, and when it was."""
-    table = plain_table()
+    table = plain_table(gap=1)
     table.add_column("run", overflow="fold")
     for heading in ("best at", "of", "min"):
         table.add_column(heading, justify="right", no_wrap=True)
@@ -120,14 +113,18 @@ def differences_table(runs: Sequence[Run]) -> Table | None:
 
 
 def plot_curves(runs: Sequence[Run]) -> Figure:
-    """The runs' evaluations against transitions, a panel a metric."""
-    figure, panels = new_figure(10.0, 7.0, columns=2, rows=2)
-    for axes, (metric, title) in zip(panels.flat, _TITLES.items(), strict=True):
+    """The runs' evaluations against transitions, a panel for each metric of narrow tables."""
+    metrics = [METRICS[name] for name in columns()]
+    rows = -(-len(metrics) // 2)
+    figure, panels = new_figure(10.0, 3.5 * rows, columns=2, rows=rows)
+    for axes, metric in zip(panels.flat, metrics, strict=False):
         for run, style in zip(runs, cycle(LINE_STYLES), strict=False):
-            axes.plot(run.curves["timesteps"], run.curves[metric], style, linewidth=1.3, label=run.name)
-        axes.set(xlabel="transitions", title=title)
-        axes.set_ylim(bottom=0)
+            axes.plot(run.curves["timesteps"], run.curves[metric.name], style, linewidth=1.3, label=run.name)
+        axes.set(xlabel="transitions", title=metric.name.replace("_", " ") + (f" [{metric.unit}]" if metric.unit else ""))
+        axes.set_ylim(bottom=0 if all(not (run.curves[metric.name] < 0).any() for run in runs) else None)
         axes.grid(alpha=0.3)
         axes.title.set_fontsize(10)
+    for unused in panels.flat[len(metrics) :]:
+        unused.set_axis_off()
     figure.legend(*panels.flat[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8)
     return figure

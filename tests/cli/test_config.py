@@ -5,6 +5,7 @@ import yaml
 
 from sb3_flock.cli import main
 
+CONFIGS = Path(__file__).parents[2] / "configs"
 RUN = Path(__file__).parent.parent / "data" / "format_2" / "runs" / "ddpg"
 
 
@@ -41,6 +42,33 @@ def test_numbers_of_a_file_may_have_an_exponent(tmp_path, capsys):
     config = printed(capsys, "--config", write(tmp_path, text))
     assert (config["total_timesteps"], config["train_env"]["flock_sizes"]) == (100_000, [10])
     assert (config["algorithm"]["batch_size"], config["algorithm"]["gamma"]) == (100, 0.9)
+
+
+def test_expert_mpc_is_the_training_of_its_config_file_for_any_task(capsys):
+    preset = printed(capsys, "--expert", "mpc", "--n-vehicles", "5", "--n-obstacles", "2")
+    file = printed(capsys, "--config", str(CONFIGS / "ddpg_bc_5v2o.yaml"))
+    assert preset["train_env"].pop("flock_sizes") is None  # as in the task
+    assert file["train_env"].pop("flock_sizes") == [5]
+    assert preset == file
+    other = printed(capsys, "--expert", "mpc")
+    task = {"n_vehicles": 3, "n_obstacles": 1}
+    assert other == {**preset, "scenario": {**preset["scenario"], **task}, "train_env": other["train_env"]}
+
+
+def test_the_preset_of_an_expert_gives_way_to_the_file_and_to_every_other_flag(tmp_path, capsys):
+    file = write(tmp_path, "total_timesteps: 300000\nalgorithm:\n  gamma: 0.9\ntrain_env:\n  expert: orca\n")
+    words = ["--expert", "mpc", "--config", file, "--n-flocks", "4", "--set", "bc_coef=2"]
+    config = printed(capsys, *words)
+    assert (config["total_timesteps"], config["n_flocks"], config["train_env"]["expert"]) == (300_000, 4, "mpc")
+    algorithm = config["algorithm"]
+    assert (algorithm["gamma"], algorithm["bc_coef"], algorithm["batch_size"]) == (0.9, 2.0, 256)
+    assert printed(capsys, *words, "--set", "train_env.expert=orca")["train_env"]["expert"] == "orca"
+
+
+@pytest.mark.parametrize("name", ["orca", "olfati-saber"])
+def test_an_expert_without_a_preset_is_the_only_change(name, capsys):
+    default, config = printed(capsys), printed(capsys, "--expert", name)
+    assert config == {**default, "train_env": {**default["train_env"], "expert": name}}
 
 
 def test_output_writes_the_config_to_a_file(tmp_path, capsys, fails):

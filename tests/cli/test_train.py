@@ -33,6 +33,8 @@ def test_train_leaves_a_run_folder_prints_the_table_and_the_path_last(tmp_path, 
         (["--algo", "ppo"], ["algo = 'ppo'", *ALGORITHMS]),
         (["--obstacle-motion", "siege"], ["scenario.obstacle_motion = 'siege'", "'walk' or 'crossing'"]),
         (["--set", "train_env.expert=magic"], ["train_env.expert = 'magic'", "mpc, olfati-saber, orca or null"]),
+        (["--expert", "magic"], ["train_env.expert = 'magic'", "mpc, olfati-saber, orca or null"]),
+        (["--expert", "mpc", "--algo", "td3"], ["algorithm.bc_coef = 10.0", "input should be 0 without algo ddpg"]),
         (["--set", "gama=0.9"], ["gama is not a parameter", "did you mean algorithm.gamma?"]),
         (["--set", "gamma"], ["--set gamma", "KEY=VALUE"]),
         (["--set", "n_anchors=5"], ["FlockCNN", "do not fit"]),
@@ -58,8 +60,10 @@ def test_help_says_what_n_vehicles_is_and_lists_every_algorithm(capsys, monkeypa
         main(["train", "--help"])
     shown = " ".join(capsys.readouterr().out.split())
     assert "learning algorithm: ddpg, ddpg-sb3, td3, sac, plugin [ddpg]" in shown
-    assert "number of vehicles of the task (paper: 3 or 5); the training env has flocks of 4, unless --set" in shown
-    assert "train_env.flock_sizes=null [3]" in shown
+    assert "number of vehicles of the task (paper: 3 or 5); the training env has flocks of 4, unless " in shown
+    assert "--expert mpc or --set train_env.flock_sizes=null [3]" in shown
+    assert "expert to learn from: mpc, olfati-saber, orca; mpc also sets what such a training needs" in shown
+    assert "the others set train_env.expert alone [none (paper: null)]" in shown
 
 
 def test_ctrl_c_leaves_a_checkpoint_and_exits_130(tmp_path):

@@ -10,7 +10,7 @@ from rich.console import Console
 from sb3_flock import FlockEvalCallback, make_vec_env
 from sb3_flock.controllers import make_controller
 from sb3_flock.evaluation import METRICS, EpisodeMetric, EpisodeMetrics, evaluate, register_metric, summarize
-from sb3_flock.evaluation.metrics import columns, is_higher_better, score
+from sb3_flock.evaluation.metrics import columns, is_higher_better, lattice_rings, score, wilson_interval
 from sb3_flock.evaluation.report import metrics_table, short_cells, short_summary, write_json
 from sb3_flock.rl.registry import build_model
 from sb3_flock.sim import Scenario, World, episode_rng
@@ -51,6 +51,7 @@ def test_every_metric_by_hand():
     assert values["neighbor_violation_rate"] == pytest.approx(2 / 12)
     assert values["obstacle_violation_rate"] == pytest.approx(1 / 12)
     assert values["connectivity"] == 0.5
+    assert values["violation_free_rate"] == 0.0
     assert values["success_rate"] == 0.0  # it ends well, but there was a violation
     assert values["return"] == pytest.approx(6 / 3 + 3 / 3 - 3 / 3)
 
@@ -61,7 +62,7 @@ def reference(scenario, episode):
     errors, all_errors, pair_means, linked, connected = [], [], [], [], []
     smallest_pair = smallest_obstacle = np.inf
     neighbor_violations = obstacle_violations = 0
-    arrived = False
+    arrived, radius = False, scenario.link_range * (1 if n <= 7 else 2)
     for k, (positions, obstacles, waypoint, _) in enumerate(episode, start=1):
         distances = [float(np.hypot(*(position - waypoint))) for position in positions]
         all_errors += distances
@@ -92,7 +93,7 @@ def reference(scenario, episode):
             pair_means += pairs
             linked += [distance for distance in pairs if distance < scenario.link_range]
             connected.append(len(reached) == n)
-            arrived = connected[-1] and max(distances) < scenario.link_range
+            arrived = connected[-1] and max(distances) < radius
     meets = smallest_obstacle < scenario.detection_range
     nan = float("nan")
     return {
@@ -106,13 +107,14 @@ def reference(scenario, episode):
         "obstacle_violation_rate": obstacle_violations / (n * horizon) if scenario.n_obstacles else nan,
         "neighbor_violation_rate": neighbor_violations / (n * horizon) if n > 1 else nan,
         "connectivity": np.mean(connected),
+        "violation_free_rate": float(not neighbor_violations and not obstacle_violations),
         "success_rate": float(arrived and not neighbor_violations and not obstacle_violations),
         "return": sum(np.mean(rewards) for *_, rewards in episode),
     }
 
 
 @settings(max_examples=40, deadline=None)
-@given(st.integers(0, 2**31), st.integers(1, 5), st.integers(0, 3), st.integers(1, 9), st.floats(0.05, 0.6))
+@given(st.integers(0, 2**31), st.integers(1, 9), st.integers(0, 3), st.integers(1, 9), st.floats(0.05, 0.6))
 def test_every_metric_against_loops_over_the_bodies(seed, n_vehicles, n_obstacles, max_cycles, spread):
     scenario = Scenario(n_vehicles=n_vehicles, n_obstacles=n_obstacles, max_cycles=max_cycles)
     rng, flocks = np.random.default_rng(seed), 3
@@ -142,6 +144,40 @@ def test_success_needs_no_violation_and_a_connected_end_at_the_waypoint():
     assert gather([far, far, far, good])["success_rate"] == 1.0
     assert gather([good, good, good, far])["success_rate"] == 0.0
     assert gather([good, good, good, split])["success_rate"] == 0.0
+
+
+def lattice(n_vehicles, edge):
+    """The nearest points of a hexagonal lattice around the origin."""
+    span = range(-5, 6)
+    points = [(edge * (i + j / 2), edge * j * 3**0.5 / 2) for i in span for j in span]
+    return sorted(points, key=lambda point: round(np.hypot(*point), 9))[:n_vehicles]
+
+
+@pytest.mark.parametrize("n", [1, 2, 7, 8, 19, 20, 37, 38, 61])
+def test_flocks_of_any_size_can_succeed_within_the_rings_that_hold_them(n):
+    scenario = Scenario(n_vehicles=n, n_obstacles=0, max_cycles=2)
+    reach = lattice_rings(n) * scenario.link_range
+    loose, dense = lattice(n, 0.999 * scenario.link_range), lattice(n, 1.05 * scenario.neighbor_separation)
+    east = max(dense)
+    for positions, waypoint, success in (
+        (loose, (0.0, 0.0), 1.0),
+        (dense, (east[0] - 0.999 * reach, east[1]), 1.0),
+        (dense, (east[0] - 1.001 * reach, east[1]), 0.0),
+    ):
+        assert gather([(positions, [], waypoint, [0] * n)] * 2, scenario)["success_rate"] == success
+
+
+def test_up_to_seven_vehicles_must_be_within_link_range_of_the_waypoint():
+    assert [lattice_rings(n) for n in (1, 2, 3, 5, 7, 8, 19, 20, 200)] == [1, 1, 1, 1, 1, 2, 2, 3, 8]
+
+
+def test_an_episode_is_free_whatever_its_end_unless_a_separation_is_violated_once():
+    split = ([(0.14, 0.0), (-0.14, 0.0), (0.0, 0.14)], [(1.0, 1.0)], (0.9, 0.0), (0, 0, 0))
+    close = ([(0.14, 0.0), (-0.14, 0.0), (0.08, 0.0)], [(1.0, 1.0)], (0.9, 0.0), (0, 0, 0))
+    near = ([(0.14, 0.0), (-0.14, 0.0), (0.0, 0.14)], [(0.0, -0.05)], (0.9, 0.0), (0, 0, 0))
+    assert gather([split] * 4)["violation_free_rate"] == 1.0
+    assert gather([close, split, split, split])["violation_free_rate"] == 0.0
+    assert gather([split, split, split, near])["violation_free_rate"] == 0.0
 
 
 def test_thresholds_are_strict():
@@ -197,6 +233,31 @@ def test_the_interval_is_the_percentile_bootstrap():
     assert metric.high - metric.low == pytest.approx(2 * 1.96 * values.std() / np.sqrt(150), rel=0.05)
 
 
+@given(st.integers(1, 5000), st.floats(0, 1))
+def test_an_end_of_wilsons_interval_is_a_share_from_which_the_observed_one_is_z_standard_errors_away(n, share):
+    share = round(share * n) / n
+    low, high = wilson_interval(share, n)
+    assert 0 <= low <= share <= high <= 1
+    for end in (low, high):
+        error = (end * (1 - end) / n) ** 0.5
+        assert abs(share - end) == pytest.approx(1.959964 * error, rel=1e-5, abs=1e-9)
+
+
+def test_episodes_that_are_all_alike_leave_an_interval_where_a_metric_is_0_or_1_in_each():
+    names = ("violation_free_rate", "success_rate", "connectivity")
+    summary = summarize({name: np.ones(1000) for name in names})
+    for name in names[:2]:
+        assert (summary[name].mean, summary[name].high, summary[name].n) == (1.0, 1.0, 1000)
+        assert summary[name].low == pytest.approx(1000 / (1000 + 1.959964**2), rel=1e-9)
+    assert summary["connectivity"].low == 1.0  # a mean over steps: the bootstrap
+    none = summarize({"success_rate": np.zeros(10)})["success_rate"]
+    assert (none.mean, none.low) == (0.0, 0.0)
+    assert none.high == pytest.approx(0.2775, abs=1e-4)
+    one = summarize({"success_rate": np.array([0.0, 1.0, np.nan, 1.0, 1.0])})["success_rate"]  # 3 of 4
+    assert (one.low, one.high) == pytest.approx((0.3006, 0.9544), abs=1e-4)
+    assert [name for name, metric in METRICS.items() if metric.is_binary] == ["violation_free_rate", "success_rate"]
+
+
 def test_the_score_adds_violations_and_lost_connectivity_to_the_tracking_error():
     base = {"tracking_error": 0.1, "neighbor_violation_rate": 0.0, "obstacle_violation_rate": 0.0, "connectivity": 1.0}
     assert score(base) == pytest.approx(0.1)
@@ -214,7 +275,10 @@ def test_every_metric_names_its_unit_direction_and_description():
         assert is_higher_better(name) == (metric.better == "higher")
         assert metric.description
         assert ("[m]" in metric.description) == (metric.unit == "m"), name
-    assert list(columns()) == ["tracking_error", "obstacle_violation_rate", "neighbor_violation_rate", "connectivity"]
+    assert list(columns()) == [
+        "tracking_error", "obstacle_violation_rate", "neighbor_violation_rate", "connectivity", "violation_free_rate",
+        "success_rate",
+    ]  # fmt: skip
     assert not is_higher_better("score")
 
 

@@ -62,6 +62,12 @@ def test_a_card_keeps_every_training_and_the_zip_is_the_best_ones(tmp_path, monk
     json.dumps(card, allow_nan=False)
 
 
+def test_a_card_without_a_metric_that_came_later_has_no_median_of_it():
+    old = {"tracking_error": 0.1, "connectivity": None}
+    card = {"seeds": [{"metrics": {**old, "violation_free_rate": 0.5}}, {"metrics": old}]}
+    assert median_of_seeds(card) == {"tracking_error": 0.1}
+
+
 def test_a_file_of_the_same_name_wins_over_a_shipped_policy(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert find_policy("ddpg-5v2o").parent.name == "pretrained"

@@ -320,6 +320,8 @@ def test_a_run_of_format_2_ends_as_the_release_that_began_it_ended_it(name, chec
     assert steps[0] < 450
     assert steps[-1] >= 1000
     assert all(len(evaluations[metric]) == len(steps) for metric in evaluations.files)
+    assert np.isnan(evaluations["violation_free_rate"][0])  # a metric that the earlier release did not have
+    assert np.isfinite(evaluations["violation_free_rate"][-1])
     with open(folder / "progress.csv", encoding="utf-8") as file:
         rows = [int(row["time/total_timesteps"]) for row in csv.DictReader(file) if row["time/total_timesteps"]]
     assert rows[0] < 450

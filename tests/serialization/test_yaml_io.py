@@ -98,3 +98,13 @@ def test_an_override_by_an_old_name_warns_and_works():
     with pytest.warns(RenamedWarning, match="update_ratio is now algorithm.utd_ratio"):
         config = load_config(TrainingConfig, overrides={"update_ratio": 0.7})
     assert config.algorithm.utd_ratio == 0.7
+
+
+def test_defaults_stand_only_where_neither_the_file_nor_an_override_says_otherwise(tmp_path):
+    file = tmp_path / "config.yaml"
+    file.write_text("algorithm:\n  gamma: 0.9\nn_flocks: 3\n")
+    defaults = {"gamma": 0.5, "n_flocks": 7, "seed": 5, "scenario.reward.scale": 0.3, "lambda_": 0.4}
+    config = load_config(TrainingConfig, file, {"seed": 6}, defaults=defaults)
+    assert (config.algorithm.gamma, config.n_flocks, config.seed) == (0.9, 3, 6)
+    assert (config.scenario.reward.scale, config.scenario.reward.lambda_) == (0.3, 0.4)
+    assert load_config(TrainingConfig, base=config, defaults=defaults) == config

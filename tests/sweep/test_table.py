@@ -15,6 +15,8 @@ METRICS = {
     "obstacle_violation_rate": 0.0001,
     "neighbor_violation_rate": 0.0034,
     "connectivity": 0.9923,
+    "violation_free_rate": 1.0,
+    "success_rate": 0.998,
 }
 
 
@@ -58,9 +60,10 @@ def test_the_table_has_the_ended_trials_and_the_running_ones_within_80_columns()
     text = "\n".join(lines)
     assert "waiting" not in text
     (first,) = [line for line in lines if line.strip().startswith("00000-seed=0")]
-    assert first.split()[1:] == ["done", "100%", "0.087", "0.01%", "0.34%", "99.23%"]
+    assert first.split()[1:] == ["done", "100%", "0.087", "0.01%", "0.34%", "99.23%", "100.00%", "99.80%"]
     (second,) = [line for line in lines if line.strip().startswith("00001-seed=1")]
-    assert second.split()[1:] == ["running", "50%", "0.087", "0.01%", "0.34%", "99.23%"]
+    assert second.split()[1:] == ["running", "50%", "0.087", "0.01%", "0.34%", "99.23%", "100.00%", "99.80%"]
+    assert len(second.split()[0]) >= 12
     callback.on_experiment_end([running, done])
     shown = callback.console.file.getvalue()
     assert "1 running, 1 done" in shown
@@ -91,7 +94,8 @@ def test_without_a_terminal_each_event_is_a_plain_line():
     assert callback.console.file.getvalue().splitlines() == [
         "[1 of 1 done] 00001: starts",
         "[1 of 1 done] 00001: lost; resumes from its last checkpoint",
-        "[1 of 1 done] 00000: done, tracking 0.087, obstacle viol. 0.01%, neighbor viol. 0.34%, connected 99.23%",
+        "[1 of 1 done] 00000: done, tracking 0.087, obst. viol. 0.01%, neigh. viol. 0.34%, connected 99.23%, free 100.00%, "
+        "success 99.80%",
         "[1 of 1 done] 00001: failed",
     ]
 

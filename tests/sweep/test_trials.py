@@ -1,5 +1,6 @@
 """What one trial reports, without Ray around it."""
 
+import numpy as np
 import pytest
 
 pytest.importorskip("ray")
@@ -33,6 +34,13 @@ def test_a_training_reports_its_evaluations_its_checkpoints_and_its_test(reporte
     assert sum(saved is not None for _, saved in reported[:-1]) >= 1
     assert {row["score"] for row, _ in reported[:-1]} > {float("inf")}
     assert not (tmp_path / "runs").exists()  # Ray has the copy
+
+
+def test_evaluations_of_an_earlier_version_may_lack_a_metric(tmp_path):
+    np.savez(tmp_path / "evaluations.npz", tracking_error=[0.3, 0.2], score=[0.5, 0.4], seconds=[60.0, 120.0])
+    reports = trials.Reports(1000)
+    reports.read(tmp_path)
+    assert reports.row == {"timesteps": 0, "total_timesteps": 1000, "tracking_error": 0.2, "score": 0.4, "minutes": 2.0}
 
 
 @pytest.mark.parametrize(

@@ -102,6 +102,23 @@ def test_a_restored_callback_continues_its_evaluations(tmp_path):
     assert second.best_score <= first.best_score
 
 
+def test_a_run_that_began_without_a_metric_continues_with_it(tmp_path):
+    first = FlockEvalCallback(SCENARIO, 40, 2, tmp_path)
+    learn(first, steps=60)
+    state = first.state_dict()
+    del state["history"]["violation_free_rate"]
+
+    class Restored(FlockEvalCallback):
+        def _on_training_start(self):
+            super()._on_training_start()
+            self.load_state_dict(state)
+
+    learn(Restored(SCENARIO, 40, 2, tmp_path), steps=96)
+    after = np.load(tmp_path / "evaluations.npz")
+    assert np.isnan(after["violation_free_rate"]).tolist() == [True, True, False, False]
+    assert not np.isnan(after["success_rate"]).any()
+
+
 def test_evaluations_are_logged_under_eval(tmp_path):
     logged = []
 
@@ -116,6 +133,6 @@ def test_evaluations_are_logged_under_eval(tmp_path):
     evaluations = np.load(tmp_path / "evaluations.npz")
     assert [step for step, _ in logged] == evaluations["timesteps"].tolist()
     for number, (_, values) in enumerate(logged):
-        for name in ("tracking_error", "connectivity", "score"):
+        for name in ("tracking_error", "connectivity", "violation_free_rate", "score"):
             assert values[f"eval/{name}"] == evaluations[name][number]
         assert isinstance(values["eval/trajectory"], Figure)

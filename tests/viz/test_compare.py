@@ -6,6 +6,7 @@ from rich.console import Console
 
 from sb3_flock.cli import main
 from sb3_flock.config.training import TrainingConfig
+from sb3_flock.evaluation import METRICS, EpisodeMetric, register_metric
 from sb3_flock.serialization.yaml_io import load_config, to_yaml
 from sb3_flock.settings import SettingsError
 from sb3_flock.viz.compare import differences_table, load_runs, plot_curves, results_table
@@ -38,8 +39,8 @@ def text(table, width=80):
 
 def test_each_run_is_shown_at_its_best(runs):
     shown = text(results_table(load_runs(runs))).splitlines()
-    assert shown[4].split() == ["a/one", "20k", "300k", "4", "0.011", "3.10%", "2.10%", "4.10%"]
-    assert shown[5].split() == ["b", "10k", "300k", "3", "0.010", "3.00%", "2.00%", "4.00%"]
+    assert shown[4].split() == ["a/one", "20k", "300k", "4", "0.011", "3.10%", "2.10%", "4.10%", "-", "-"]
+    assert shown[5].split() == ["b", "10k", "300k", "3", "0.010", "3.00%", "2.00%", "4.00%", "-", "-"]
     assert max(map(len, shown)) <= 80
 
 
@@ -51,8 +52,20 @@ def test_only_what_differs_in_the_configs_is_shown(runs):
 
 def test_the_curves_are_drawn(runs):
     figure = plot_curves(load_runs(runs))
-    assert [[len(line.get_xdata()) for line in axes.lines] for axes in figure.axes] == [[3, 2]] * 4
+    assert [[len(line.get_xdata()) for line in axes.lines] for axes in figure.axes] == [[3, 2]] * 6
+    assert [axes.get_title() for axes in figure.axes[::4]] == ["tracking error [m]", "violation free rate"]
     np.testing.assert_allclose(figure.axes[0].lines[1].get_ydata(), [0.01, 0.011])
+    assert np.isnan(figure.axes[4].lines[0].get_ydata()).all()  # of a metric that was registered later
+
+
+def test_every_metric_of_narrow_tables_has_a_panel(runs, restored):
+    restored(METRICS)
+    register_metric(type("Gain", (EpisodeMetric,), {"name": "gain", "unit": "m", "column": "gain"}))
+    curves = dict(np.load(runs[0] / "evaluations.npz"))
+    np.savez(runs[0] / "evaluations.npz", **curves, gain=np.array([-1.0, 0.5, 2.0]))
+    *panels, unused = plot_curves(load_runs(runs)).axes
+    assert (len(panels), panels[-1].get_title(), unused.axison) == (7, "gain [m]", False)
+    assert panels[-1].get_ylim()[0] < -1.0 < 0.0 == panels[0].get_ylim()[0]
 
 
 def test_the_command(runs, tmp_path, capsys):
