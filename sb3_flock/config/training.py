@@ -47,6 +47,7 @@ class TrainEnvConfig(Settings):
         0.5, description="factor on the square of obstacles that walk, unless obstacle_starts is set (paper: 1)"
     )
     time_step_scale: Positive = Field(2.0, description="factor on the sampling period (paper: 1)")
+    action_repeat: int = Field(1, ge=1, le=1000, description="sampling periods for which an action is repeated (paper: 1)")
     separation_scale: float = Field(1.06, ge=1, le=1e6, description="factor on the minimum separations (paper: 1)")
     obstacle_separation_scale: float | None = Field(
         None, ge=1, le=1e6, description="the same for obstacles; null: separation_scale (paper: 1)"

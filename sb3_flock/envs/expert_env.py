@@ -34,6 +34,7 @@ class ExpertEnv(parallel_env):
     :param noise_std: standard deviation of the noise on the expert's executed actions [half the action range]
     :param queries: put ``expert_action`` into every info; otherwise the expert acts only for the flocks that it drives
     :param n_flocks: number of independent flocks
+    :param action_repeat: sampling periods that a step takes, with the same actions
     """
 
     def __init__(
@@ -44,8 +45,9 @@ class ExpertEnv(parallel_env):
         noise_std: float,
         queries: bool = False,
         n_flocks: int = 1,
+        action_repeat: int = 1,
     ) -> None:
-        super().__init__(scenario, n_flocks=n_flocks)
+        super().__init__(scenario, n_flocks=n_flocks, action_repeat=action_repeat)
         acts_for_all = queries or n_flocks == 1
         self._seen = self.world if acts_for_all else World(scenario)
         self.expert, self.fraction, self.noise_std, self.queries = make_expert(self._seen), fraction, noise_std, queries

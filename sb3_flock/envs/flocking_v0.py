@@ -91,6 +91,7 @@ class parallel_env(ParallelEnv[str, Observation, Action]):  # noqa: N801 - Petti
     :param scenario: the task; fields given by name change it
     :param render_mode: ``None``, ``"human"`` or ``"rgb_array"``; the first flock is drawn
     :param n_flocks: number of independent flocks
+    :param action_repeat: sampling periods that a step takes, with the same actions; rewards are means over them
     :param fields: fields of :class:`~sb3_flock.Scenario` by name
     :raises SettingsError: for an unknown field, a value that is not accepted or an unknown render mode
 
@@ -106,9 +107,16 @@ class parallel_env(ParallelEnv[str, Observation, Action]):  # noqa: N801 - Petti
     }
 
     def __init__(
-        self, scenario: Scenario | None = None, render_mode: str | None = None, n_flocks: int = 1, **fields: Any
+        self,
+        scenario: Scenario | None = None,
+        render_mode: str | None = None,
+        n_flocks: int = 1,
+        action_repeat: int = 1,
+        **fields: Any,
     ) -> None:
         check_integer("n_flocks", n_flocks, least=1)
+        check_integer("action_repeat", action_repeat, least=1)
+        self.action_repeat = action_repeat
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise SettingsError(f"render_mode = {render_mode!r}: one of {self.metadata['render_modes']} or None is needed")
         self.scenario = (scenario or Scenario()).replace(**fields)
@@ -152,9 +160,8 @@ class parallel_env(ParallelEnv[str, Observation, Action]):  # noqa: N801 - Petti
     def step(
         self, actions: dict[str, Action]
     ) -> tuple[dict[str, Observation], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
-        """Move everything by one sampling period; see the module's page for what comes back."""
-        sensing, executed = self.world.step(self.commands(actions))
-        terms = reward_terms(sensing, executed, self.scenario.reward, self.scenario)
+        """Move everything by a sampling period, or by several; see the module's page for what comes back."""
+        sensing, terms = self._advance(self.commands(actions))
         truncated = self.world.steps >= self.scenario.max_cycles
         infos = self._infos(sensing, terms, truncated)
         result = (
@@ -225,6 +232,18 @@ class parallel_env(ParallelEnv[str, Observation, Action]):  # noqa: N801 - Petti
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
+
+    def _advance(self, commands: NDArray[np.float64]) -> tuple[Sensing, dict[str, NDArray[np.float64]]]:
+        """Take the world's steps of one step: what is sensed at the end, and the means of the reward's terms."""
+        steps = min(self.action_repeat, self.scenario.max_cycles - self.world.steps)
+        totals: dict[str, NDArray[np.float64]] = {}
+        for number in range(max(steps, 1)):  # after the last step the world says that no episode is running
+            if number:
+                self.world.sensors.measure(sensing)  # the sensors remember every sampling period
+            sensing, executed = self.world.step(commands)
+            terms = reward_terms(sensing, executed, self.scenario.reward, self.scenario)
+            totals = {name: totals[name] + term for name, term in terms.items()} if number else terms
+        return sensing, {name: total / steps for name, total in totals.items()} if steps > 1 else totals
 
     def _observations(self, sensing: Sensing) -> dict[str, Observation]:
         observations = observe(self.measure(sensing), self.scenario)

@@ -194,7 +194,7 @@ def make_training_env(config: TrainingConfig) -> ParameterSharingVecEnv:
 def _make_flocks(config: TrainingConfig, scenario: Scenario, n_flocks: int) -> parallel_env:
     train_env = config.train_env
     if train_env.expert is None:
-        return parallel_env(scenario, n_flocks=n_flocks)
+        return parallel_env(scenario, n_flocks=n_flocks, action_repeat=train_env.action_repeat)
     make_expert = EXPERTS[train_env.expert]
     return ExpertEnv(
         scenario,
@@ -203,6 +203,7 @@ def _make_flocks(config: TrainingConfig, scenario: Scenario, n_flocks: int) -> p
         train_env.expert_noise_std,
         queries=config.algorithm.bc_coef > 0,
         n_flocks=n_flocks,
+        action_repeat=train_env.action_repeat,
     )
 
 

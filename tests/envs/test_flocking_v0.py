@@ -6,6 +6,7 @@ import pytest
 from gymnasium.utils.env_checker import data_equivalence
 
 from sb3_flock import flocking_v0
+from sb3_flock.envs.flocking_v0 import parallel_env
 from sb3_flock.settings import SettingsError
 from sb3_flock.sim import Channel, Scenario, register_channel
 from sb3_flock.sim.observation import CHANNELS
@@ -228,3 +229,26 @@ def test_a_state_of_another_number_of_flocks_is_refused():
         flocking_v0.parallel_env(n_flocks=2).load_state_dict(env.state_dict())
     with pytest.raises(SettingsError, match="n_flocks = 0"):
         flocking_v0.parallel_env(n_flocks=0)
+
+
+def test_a_repeated_action_takes_as_many_sampling_periods_and_gives_their_mean_reward():
+    task = Scenario(n_vehicles=3, n_obstacles=1, max_cycles=5, motion_lag=0.2)
+    plain, repeating = parallel_env(task), parallel_env(task, action_repeat=2)
+    plain.reset(seed=0), repeating.reset(seed=0)
+    rng = np.random.default_rng(0)
+    for periods in (2, 2, 1):  # the last step ends with the episode
+        actions = {name: rng.uniform([0, -3], [0.15, 3]).astype(np.float32) for name in repeating.agents}
+        steps = [plain.step(actions) for _ in range(periods)]
+        observations, rewards, _, truncations, infos = repeating.step(actions)
+        for name in observations:
+            np.testing.assert_array_equal(observations[name], steps[-1][0][name])
+            assert rewards[name] == pytest.approx(np.mean([step[1][name] for step in steps]), abs=1e-12)
+            assert sum(infos[name]["reward_terms"].values()) == pytest.approx(rewards[name])
+            assert infos[name]["metrics"] == steps[-1][-1][name]["metrics"]
+        assert truncations == steps[-1][3]
+    assert not repeating.agents
+
+
+def test_a_repetition_that_is_not_a_positive_number_is_refused():
+    with pytest.raises(SettingsError, match="action_repeat = 0"):
+        parallel_env(action_repeat=0)
