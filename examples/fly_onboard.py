@@ -1,5 +1,7 @@
 """One vehicle's own computer: numpy and onnxruntime alone, with a policy from ``sb3-flock export ddpg-5v2o policy.onnx``.
 
+With ``--set safety_filter=announce`` the exported policy keeps its separation to the neighbors by itself.
+
 On a real vehicle the positions come from the radio and the sensors; here a small simulated world of points gives them.
 """
 
@@ -16,6 +18,7 @@ task = json.loads(policy.get_modelmeta().custom_metadata_map["sb3_flock"])
 
 position, heading = np.array([-0.6, -0.4]), 0.0  # of this vehicle; the policy does not get them
 neighbors, obstacles = np.array([[0.1, 0.0], [-0.1, 0.05]]), np.array([[-0.3, -0.2]])
+neighbor_headings = np.array([0.0, np.pi / 2])  # only a safety filter that knows headings needs them
 waypoint = np.zeros(2)
 
 
@@ -42,7 +45,17 @@ for step in range(100):
         ego_motion = np.append(in_body_frame(origin, angle, position)[0], heading - angle)  # from odometry
         previous = {f"previous_{name}": points for name, points in before.items()}
         inputs = {**now, **previous, "ego_motion": ego_motion}
-    (speed, turn_rate), *_ = policy.run(None, inputs)  # m/s, rad/s, to hold for one sampling period
+    safety_filter = task.get("safety_filter", "off")
+    if safety_filter in ("heading", "announce"):
+        inputs = {**inputs, "neighbor_headings": neighbor_headings - heading}  # NaN for a neighbor that sends none
+    if (
+        safety_filter == "announce"
+    ):  # announce a speed, and wait for the neighbors' announcements, NaN for one that is missing
+        silence = {"neighbor_announced_speeds": np.zeros(len(neighbors))}
+        (announced_speed,) = policy.run(["announced_speed"], {**inputs, **silence})
+        inputs = {**inputs, "neighbor_announced_speeds": np.zeros(len(neighbors))}  # these neighbors stand still
+    (action,) = policy.run(["action"], inputs)
+    speed, turn_rate = action  # m/s, rad/s, to hold for one sampling period
     position = position + speed * task["time_step"] * np.array([np.cos(heading), np.sin(heading)])
     heading += turn_rate * task["time_step"]
     if step % 10 == 9:

@@ -57,9 +57,12 @@ def test_parameter_sharing(tmp_path):
     assert "[[1" in output
 
 
-@pytest.mark.parametrize("policy", ["ddpg-5v2o", "ddpg-bc-5v2o"])
-def test_the_onboard_example_needs_numpy_and_onnxruntime_alone(tmp_path, policy):
-    assert main(["export", policy, str(tmp_path / "policy.onnx")]) == 0
+@pytest.mark.parametrize(
+    ("policy", "settings"),
+    [("ddpg-5v2o", []), ("ddpg-bc-5v2o", []), ("ddpg-bc-5v2o", ["--set", "safety_filter=announce"])],
+)
+def test_the_onboard_example_needs_numpy_and_onnxruntime_alone(tmp_path, policy, settings):
+    assert main(["export", policy, "-o", str(tmp_path / "policy.onnx"), *settings]) == 0
     output = run("fly_onboard.py", tmp_path / "policy.onnx", cwd=tmp_path)
     last = [float(number) for number in re.findall(r"([\d.]+) m ", output.splitlines()[-1])]
     assert last[0] < 0.15

@@ -14,27 +14,33 @@ from sb3_flock.errors import SettingsError
 
 def add(parser: Parser) -> None:
     """Add the arguments."""
+    from sb3_flock.sim import Scenario
+
     parser.describe(
         "ddpg-5v2o -o policy.onnx",
         description="Write a policy as an ONNX graph from measured positions to speed and turn rate, and check it.",
-        usage="%(prog)s [-h] -o FILE [--trust] POLICY",
+        usage="%(prog)s [-h] -o FILE [--trust] [--set KEY=VALUE] POLICY",
     )
     parser.add_argument("policy", metavar="POLICY", help=shared.POLICY_HELP)
     parser.add_argument("file", nargs="?", metavar="FILE", help=argparse.SUPPRESS)
     shared.add_output(parser, "file to write, such as policy.onnx")
     shared.add_trust(parser)
+    parser.add_set("safety_filter=announce", Scenario, "them all, under scenario")
 
 
 def run(options: argparse.Namespace, words: Sequence[str]) -> int:
     """Export, and print how well the graph agrees with the policy."""
     from sb3_flock.deploy.onnx_export import export
+    from sb3_flock.serialization.yaml_io import load_config
+    from sb3_flock.sim import Scenario
 
     if (options.output is None) == (options.file is None):
         raise SettingsError("export: one -o FILE to write is needed")
     output = options.output or options.file
     policy = shared.load_trusted_or_not(options.policy, trust=options.trust)
+    scenario = load_config(Scenario, overrides=shared.overrides_of(options.set), base=policy.scenario)
     with written_to("--output", output):
-        done = export(policy, output)
+        done = export(policy, output, scenario=scenario)
     print(
         f"differs from the policy by at most {done.difference:.1g} of the range over {done.n_samples} sample inputs; "
         f"{1000 * done.latency:.3f} ms a decision (median, one core)",

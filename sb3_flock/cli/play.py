@@ -13,7 +13,8 @@ def add(parser: Parser) -> None:
     """Add the arguments."""
     parser.describe(
         "general --n-vehicles 8",
-        description="Simulate live in a window: drag the waypoint, drop obstacles, add vehicles, show what one of them senses.",
+        description="Simulate live in a window: drag the waypoint, drop obstacles, add vehicles, show what one of them senses, "
+        "switch the safety filter.",
         renamed=shared.ROLLOUT_RENAMED,
     )
     shared.add_rollout(parser)

@@ -7,38 +7,31 @@ import copy
 import io
 import json
 import logging
-import time
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import torch as th
 from stable_baselines3.sac.policies import SACPolicy
 from stable_baselines3.td3.policies import TD3Policy
 from torch import nn
 
+from sb3_flock.deploy.onnx_check import compare
+from sb3_flock.deploy.onnx_safety import OnnxSafetyFilter, Shape, exact, filter_shapes, norm
 from sb3_flock.serialization.load import LoadedPolicy
 from sb3_flock.serialization.save import atomic_write, versions
 from sb3_flock.settings import RunError, SettingsError
-from sb3_flock.sim import Scenario, Sensing, World, episode_rng, observe
-from sb3_flock.sim.sensing import find_contacts
-from sb3_flock.sim.sensors import SensorErrors
+from sb3_flock.sim import Scenario
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from numpy.typing import NDArray
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
 INPUTS = ("neighbors", "obstacles", "waypoint")
 PREVIOUS_INPUTS = ("previous_neighbors", "previous_obstacles", "previous_waypoint", "ego_motion")
 """Further inputs of a policy with motion channels."""
 TOLERANCE = 1e-5
 """Largest difference to ``predict`` that an exported policy may have, as a share of the action's range; it is float32's."""
-
-SampleInput = dict[str, "NDArray[np.float64]"]
-"""The inputs of the graph by name."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +43,7 @@ class ExportResult:
     difference: float
     """Largest difference to ``predict`` over the sample inputs, as a share of the action's range."""
     latency: float
-    """Median time of a decision on one core [s]."""
+    """Median time of a decision on one core [s]; with ``announce`` the graph runs twice for one."""
 
 
 _NOTHING = th.empty(0)
@@ -107,14 +100,13 @@ class OnnxPolicy(nn.Module):
         if ego_motion is None:
             observation = present
         else:
-            cos, sin = ego_motion[2].cos(), ego_motion[2].sin()
-            frame = th.stack((th.stack((cos, -sin)), th.stack((sin, cos))))  # the present frame, in the previous one
+            to_present = _to_present(ego_motion)
             previous = {
                 "neighbors": previous_neighbors,
                 "obstacles": previous_obstacles,
                 "waypoint": previous_waypoint[None],
             }
-            observation = th.cat((present, present - self._channels(previous, lambda at: (at - ego_motion[:2]) @ frame)))
+            observation = th.cat((present, present - self._channels(previous, to_present)))
         action = self.actor(observation[None])[0]
         return self.low + (action + 1) / 2 * (self.high - self.low)
 
@@ -129,9 +121,9 @@ class OnnxPolicy(nn.Module):
         for number, (channel, radius) in enumerate(zip(scenario.channels, scenario.channel_radii, strict=True)):
             measured = bodies[channel.source]
             positions = to_present(measured)
-            in_range = _norm(measured) < ranges.get(channel.source, float("inf"))
+            in_range = norm(measured) < ranges.get(channel.source, float("inf"))
             if channel.source == "waypoint":
-                positions = positions / (_norm(positions) / radius).clamp(min=1.0)[:, None]
+                positions = positions / (norm(positions) / radius).clamp(min=1.0)[:, None]
             marked.append(nn.functional.pad(positions, (0, 1), value=float(number)))
             shown.append(in_range)
         positions, channel_of, visible = th.cat(marked)[:, :2], th.cat(marked)[:, 2].long(), th.cat(shown)
@@ -147,19 +139,78 @@ class OnnxPolicy(nn.Module):
         return (counts.double() @ gaussians).view(len(radii), side, side)
 
 
-def _norm(vectors: th.Tensor) -> th.Tensor:
-    return vectors.square().sum(-1).sqrt()
+def _to_present(ego_motion: th.Tensor) -> Callable[[th.Tensor], th.Tensor]:
+    """The transformation of positions ``(any, 2)`` [m] from the vehicle's previous frame into its present one."""
+    cos, sin = ego_motion[2].cos(), ego_motion[2].sin()
+    frame = th.stack((th.stack((cos, -sin)), th.stack((sin, cos))))  # the present frame, in the previous one
+    return lambda positions: (positions - ego_motion[:2]) @ frame
 
 
-def export(policy: LoadedPolicy, path: str | Path, n_samples: int = 1000, seed: int = 0) -> ExportResult:
+class FilteredOnnxPolicy(OnnxPolicy):
+    """The on-board part of a policy with the safety filter: the action is the one that the vehicle executes.
+
+    Positions are in the body frame [m] (forward is +x, left is +y); bodies out of sensing range are ignored. All numbers are
+    float64. Inputs: ``neighbors`` and ``obstacles`` ``(any number, 2)``, and ``waypoint`` ``(2,)``. With motion channels
+    ``previous_neighbors``, ``previous_obstacles`` and ``previous_waypoint`` are what was measured ``motion_lag`` ago in the body
+    frame of that time, and ``ego_motion`` ``(3,)`` is the vehicle's present position in that frame [m, m] and its turn since
+    [rad]. The output ``action`` ``(2,)`` is the speed [m/s] and the turn rate [rad/s].
+
+    With ``motion`` a row of ``previous_neighbors`` is the neighbor of the same row of ``neighbors``. A neighbor that is not
+    sensed now, or was not then, has a position out of sensing range there.
+
+    With ``heading`` and ``announce`` the graph also takes ``neighbor_headings`` ``(any number,)``, in the order of ``neighbors``:
+    relative to the vehicle's own heading, to the left positive [rad], NaN if not known.
+
+    With ``announce`` a step has two runs. The first one, with zeros as ``neighbor_announced_speeds`` ``(any number,)``, gives the
+    output ``announced_speed`` ``()`` [m/s], which the vehicle sends to its neighbors. The second one, with the speeds received
+    from them, 0 or NaN where none was, gives ``action``.
+
+    :param policy: a policy of DDPG, TD3 or SAC for the flock's observation
+    :param scenario: the task with its sensing ranges, its filters, and the bounds to which actions are clipped
+    :raises SettingsError: for another kind of policy
+    """
+
+    def __init__(self, policy: Any, scenario: Scenario) -> None:
+        super().__init__(policy, scenario)
+        self.filter = OnnxSafetyFilter(scenario)
+
+    def forward(  # type: ignore[override]
+        self,
+        neighbors: th.Tensor,
+        obstacles: th.Tensor,
+        waypoint: th.Tensor,
+        previous_neighbors: th.Tensor = _NOTHING,
+        previous_obstacles: th.Tensor = _NOTHING,
+        previous_waypoint: th.Tensor = _NOTHING,
+        ego_motion: th.Tensor | None = None,
+        neighbor_headings: th.Tensor | None = None,
+        neighbor_announced_speeds: th.Tensor | None = None,
+    ) -> th.Tensor | tuple[th.Tensor, th.Tensor]:
+        """The executed action, ``(2,)``; with ``announce`` also the speed to announce, ``()``."""
+        asked = super().forward(
+            neighbors, obstacles, waypoint, previous_neighbors, previous_obstacles, previous_waypoint, ego_motion
+        )
+        motions = None
+        if self.scenario.safety_filter == "motion" and ego_motion is not None:
+            was_sensed = norm(previous_neighbors) < exact(self.scenario.link_range)
+            motions = was_sensed[:, None] * (neighbors - _to_present(ego_motion)(previous_neighbors))
+        return self.filter(asked, neighbors, motions, neighbor_headings, neighbor_announced_speeds, obstacles)
+
+
+def export(
+    policy: LoadedPolicy, path: str | Path, n_samples: int = 1000, seed: int = 0, scenario: Scenario | None = None
+) -> ExportResult:
     """Write a policy as ONNX, and check that the graph acts as the policy does.
 
-    The graph is that of :class:`OnnxPolicy`. Its inputs are :data:`INPUTS`, with motion channels :data:`PREVIOUS_INPUTS` as
-    well; its output is ``action``. Ranges, sampling period and units are in the file's metadata under ``sb3_flock``, as JSON.
+    The graph is that of :class:`OnnxPolicy`, with a safety filter that of :class:`FilteredOnnxPolicy`. :func:`inputs_of` and
+    :func:`outputs_of` list its inputs and outputs. Ranges, sampling period and units are in the file's metadata under
+    ``sb3_flock``, as JSON.
 
     :param path: the file, which is written whole or not at all
     :param n_samples: number of random sample inputs on which the graph is compared with ``predict``
     :param seed: seed of the sample inputs
+    :param scenario: the task with its filters; ``None``: the one that the policy was trained for
+    :raises PolicyError: if the scenario's observations do not fit the policy
     :raises SettingsError: if a library is not installed or there is no such folder
     :raises RunError: if it differs from ``predict`` by more than :data:`TOLERANCE`
     :raises OSError: if it cannot be written
@@ -173,29 +224,16 @@ def export(policy: LoadedPolicy, path: str | Path, n_samples: int = 1000, seed: 
         import onnxscript  # noqa: F401 - torch's exporter needs it
     except ImportError as error:
         raise SettingsError(f"export needs {error.name}: pip install 'sb3_flock[onnx]'") from None
-    scenario = policy.scenario
-    module = OnnxPolicy(policy.policy, scenario).eval()
-    inputs = inputs_of(scenario)
-    any_number = {0: th.export.Dim.DYNAMIC}
-    shapes = {"waypoint": (2,), "previous_waypoint": (2,), "ego_motion": (3,)}
-    with _quiet_exporter(), th.no_grad():
-        program = th.onnx.export(
-            module,
-            tuple(th.zeros(*shapes.get(name, (2 + number, 2)), dtype=th.float64) for number, name in enumerate(inputs)),
-            input_names=inputs,
-            output_names=["action"],
-            dynamic_shapes=tuple(None if name in shapes else any_number for name in inputs),
-            dynamo=True,
-            verbose=False,
-        )
-    assert program is not None
-    model = program.model_proto
-    model.doc_string = " ".join(str(OnnxPolicy.__doc__).split(":param", maxsplit=1)[0].replace("``", "").split())
-    onnx.helper.set_model_props(model, {"sb3_flock": json.dumps(_metadata(policy))})
+    scenario = policy.scenario if scenario is None else scenario
+    policy.check(scenario)
+    bounds = [(task.max_speed, task.max_turn_rate) for task in (scenario, policy.scenario)]
+    kind = FilteredOnnxPolicy if scenario.is_filtered or bounds[0] != bounds[1] else OnnxPolicy
+    model = graph_of(kind(policy.policy, scenario), inputs_of(scenario), outputs_of(scenario))
+    onnx.helper.set_model_props(model, {"sb3_flock": json.dumps(_metadata(policy, scenario))})
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     session = onnxruntime.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
-    difference, latency = _compare(session, policy, n_samples, seed)
+    difference, latency = compare(session, policy, scenario, n_samples, seed)
     if not difference <= TOLERANCE:
         raise RunError(
             f"export {path}: the graph differs from the policy by {difference:.2g} of the range, more than {TOLERANCE:g}"
@@ -205,79 +243,80 @@ def export(policy: LoadedPolicy, path: str | Path, n_samples: int = 1000, seed: 
     return ExportResult(path, n_samples, difference, latency)
 
 
-def inputs_of(scenario: Scenario) -> tuple[str, ...]:
-    """Names of a graph's inputs, in their order."""
-    return (*INPUTS, *PREVIOUS_INPUTS) if scenario.motion_lag else INPUTS
+def graph_of(module: nn.Module, shapes: Mapping[str, Shape], outputs: Sequence[str]) -> Any:
+    """The ONNX model of a module, whose docstring the model gets.
+
+    :param shapes: shape of each input; axes with a name have any size, the same for all axes of that name
+    :param outputs: names of the outputs
+    """
+    axes = dict.fromkeys(axis for shape in shapes.values() for axis in shape)
+    sizes = {axis: 2 + number if isinstance(axis, str) else axis for number, axis in enumerate(axes)}
+    with _quiet_exporter(), th.no_grad():
+        program = th.onnx.export(
+            module.eval(),
+            kwargs={name: th.zeros([sizes[axis] for axis in shape], dtype=th.float64) for name, shape in shapes.items()},
+            input_names=list(shapes),
+            output_names=outputs,
+            dynamic_shapes={
+                name: {number: th.export.Dim.DYNAMIC for number, axis in enumerate(shape) if isinstance(axis, str)} or None
+                for name, shape in shapes.items()
+            },
+            dynamo=True,
+            verbose=False,
+        )
+    assert program is not None
+    model = program.model_proto
+    model.doc_string = " ".join(str(module.__doc__).split(":param", maxsplit=1)[0].replace("``", "").split())
+    return model
 
 
-def _metadata(policy: LoadedPolicy) -> dict[str, Any]:
-    scenario = policy.scenario
+def inputs_of(scenario: Scenario) -> dict[str, Shape]:
+    """Names and shapes of a graph's inputs, in their order."""
+    shapes: dict[str, Shape] = dict(zip(INPUTS, (("neighbors", 2), ("obstacles", 2), (2,)), strict=True))
+    if scenario.motion_lag:
+        before = "neighbors" if scenario.safety_filter == "motion" else "previous_neighbors"
+        shapes |= zip(PREVIOUS_INPUTS, ((before, 2), ("previous_obstacles", 2), (2,), (3,)), strict=True)
+    names = ("neighbor_headings", "neighbor_announced_speeds")
+    return shapes | {name: shape for name, shape in filter_shapes(scenario).items() if name in names}
+
+
+def outputs_of(scenario: Scenario) -> tuple[str, ...]:
+    """Names of a graph's outputs, in their order."""
+    return ("action", "announced_speed") if scenario.safety_filter == "announce" else ("action",)
+
+
+_HEADINGS = (
+    "; neighbor_headings (any,): in the order of neighbors, relative to the own heading, left + [rad], NaN: not known"
+)
+_INPUTS_OF_LEVELS = {
+    "motion": "; rows of previous_neighbors and neighbors are the same neighbors, out of range where not sensed",
+    "heading": _HEADINGS,
+    "announce": f"{_HEADINGS}; neighbor_announced_speeds (any,): received from them [m/s], 0 or NaN: not received; 0 in the run "
+    "that gives announced_speed",
+}
+"""What the metadata says about the inputs of the safety filter."""
+
+
+def _metadata(policy: LoadedPolicy, scenario: Scenario) -> dict[str, Any]:
     names = ("link_range", "detection_range", "neighbor_separation", "obstacle_separation", "time_step", "max_speed")
     inputs = "positions in the body frame [m], forward +x, left +y: neighbors (any, 2), obstacles (any, 2), waypoint (2,)"
     if scenario.motion_lag:
         inputs += "; previous_...: those of motion_lag [s] ago, in the frame of that time"
         inputs += "; ego_motion (3,): present position in that frame [m], turn since [rad]"
+    outputs, settings = "action (2,): speed [m/s], turn rate [rad/s]", [*names, "max_turn_rate", "motion_lag"]
+    if scenario.is_filtered:
+        settings += ["safety_filter", "obstacle_filter", "safety_margin", "obstacle_max_speed"]
+        inputs += _INPUTS_OF_LEVELS.get(scenario.safety_filter, "")
+    if scenario.safety_filter == "announce":
+        outputs += "; announced_speed (): to send to the neighbors [m/s]"
     return {
         **policy.describe(),
         "policy": policy.path.name,
         "inputs": inputs,
-        "output": "action (2,): speed [m/s], turn rate [rad/s]",
-        **{name: getattr(scenario, name) for name in (*names, "max_turn_rate", "motion_lag")},
+        "output": outputs,
+        **{name: getattr(scenario, name) for name in settings},
         "exported_with": versions(),
     }
-
-
-def _compare(session: Any, policy: LoadedPolicy, count: int, seed: int) -> tuple[float, float]:
-    """Largest difference to ``predict``, and median time of one action."""
-    space: Any = policy.policy.action_space
-    samples = list(random_sample_inputs(policy.scenario, count, seed))
-    actions, times = [], []
-    for sample, _ in samples:
-        start = time.perf_counter()
-        (action,) = session.run(None, sample)
-        times.append(time.perf_counter() - start)
-        actions.append(action)
-    expected = np.stack([policy.predict(tensor, deterministic=True)[0] for _, tensor in samples])
-    difference = np.abs(np.stack(actions) - expected) / (space.high - space.low)
-    return float(difference.max()), float(np.median(times))
-
-
-def random_sample_inputs(scenario: Scenario, count: int, seed: int) -> Iterator[tuple[SampleInput, NDArray[np.float32]]]:
-    """What one vehicle measures at the start of random episodes of all sizes, and its observation there.
-
-    With motion channels, ``motion_lag`` after the start, with random actions.
-    """
-    for number in range(count):
-        rng = episode_rng(seed, number)
-        n_vehicles, n_obstacles = int(rng.integers(1, 13)), int(rng.integers(0, 6))
-        bodies = {"n_vehicles": n_vehicles, "n_obstacles": n_obstacles, "obstacle_motion": "walk"}
-        arena = max(scenario.link_range, scenario.detection_range) * rng.uniform(2, 5)
-        free_space = {"arena": arena, "obstacle_arena": arena, "obstacle_starts": None, "sensors": SensorErrors()}
-        world = World(scenario.replace(**bodies, **free_space, max_cycles=max(1, scenario.motion_lag_steps)))
-        sensing = world.sensors.measure(world.reset([rng]))
-        sample = _measured_by_first_vehicle(world, sensing)
-        if scenario.motion_lag:
-            before = {f"previous_{name}": positions for name, positions in sample.items()}
-            (x, y), (cos, sin), heading = world.positions[0, 0], world.frames[0, 0], world.headings[0, 0]
-            for _ in range(scenario.motion_lag_steps):
-                actions = rng.uniform(world.action_low, world.action_high, (1, n_vehicles, 2))
-                sensing = world.sensors.measure(world.step(actions)[0])
-            dx, dy = world.positions[0, 0] - (x, y)
-            ego_motion = np.array([cos * dx + sin * dy, cos * dy - sin * dx, world.headings[0, 0] - heading])
-            sample = {**_measured_by_first_vehicle(world, sensing), **before, "ego_motion": ego_motion}
-        yield sample, observe(sensing, scenario)[0, 0]
-
-
-def _measured_by_first_vehicle(world: World, sensing: Sensing) -> SampleInput:
-    """Positions of all bodies in the first vehicle's frame, in range or not."""
-    neighbors, obstacles = (
-        found.positions[found.observers == 0]
-        for found in (
-            find_contacts(world.positions, world.frames, world.positions, np.inf, exclude_self=True),
-            find_contacts(world.positions, world.frames, world.obstacle_positions, np.inf),
-        )
-    )
-    return {"neighbors": neighbors, "obstacles": obstacles, "waypoint": sensing.waypoint_positions[0, 0]}
 
 
 @contextlib.contextmanager

@@ -8,10 +8,10 @@ has the proof, what each level needs to know, and what can be guaranteed about o
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from sb3_flock.settings import NotNegative
 from sb3_flock.sim.backend import compiled
@@ -45,6 +45,12 @@ class SafetySettings(SensingSettings, SensorSettings):
     safety_margin: NotNegative = Field(
         0.0, description="distance that the filters keep beyond the minimum separations, for sensor errors [m] (paper: 0)"
     )
+
+    @field_validator("safety_filter", mode="before")
+    @classmethod
+    def _off_is_a_word(cls, value: Any) -> Any:
+        """YAML reads ``off`` as false."""
+        return "off" if value is False else value
 
     @model_validator(mode="after")
     def _filter_senses_enough(self) -> SafetySettings:

@@ -23,7 +23,7 @@ except ImportError:
 
 _PANEL = 224
 """Width of the panel beside the arena [pixels]."""
-_TILE = 152
+_TILE = 146
 """Side of a channel's image [pixels]."""
 _GRAB_RADIUS = 14
 """Distance within which a press takes hold of the waypoint or an obstacle [pixels]."""
@@ -47,7 +47,8 @@ class Game:
     """An episode that the user changes while it runs: the window's content and its events.
 
     :param policy: a controller, or anything with SB3's ``predict``
-    :param scenario: the task; its episodes do not end here
+    :param scenario: the task; its episodes do not end here, and a key switches its safety filter off and on, ``announce`` if it
+        has none
     :param seed: of the episodes
     :raises SettingsError: if pygame is not installed
     """
@@ -61,6 +62,11 @@ class Game:
         self.controller = as_controller(policy, scenario)
         self.renderer = Renderer(scenario, "rgb_array", fps=0)
         self.scenario = scenario.replace(max_cycles=max(_MAX_CYCLES, scenario.max_cycles))
+        names = ("safety_filter", "obstacle_filter")
+        self._filter = (
+            {name: getattr(scenario, name) for name in names} if scenario.is_filtered else {"safety_filter": "announce"}
+        )
+        self._filter_error: str | None = None
         self.seed, self.episode = seed, 0
         self.is_paused = self.is_over = self.is_dragging = False
         self.watched: int | None = None
@@ -74,6 +80,7 @@ class Game:
             pygame.K_MINUS: self._remove_vehicle,
             pygame.K_KP_MINUS: self._remove_vehicle,
             pygame.K_v: self._watch_next,
+            pygame.K_f: self._switch_filter,
             pygame.K_r: self._next_episode,
             pygame.K_q: self._quit,
             pygame.K_ESCAPE: self._quit,
@@ -90,9 +97,17 @@ class Game:
     def caption(self) -> str:
         """The window's title: the number of bodies and the state."""
         words = [self.world.scenario.bodies]
+        words += [f"safety filter {self.filter_in_words}"] if self.scenario.is_filtered else []
         words += [f"vehicle {self.watched} is watched"] if self.watched is not None else []
         words += ["paused"] if self.is_paused else []
         return "sb3_flock: " + ", ".join(words)
+
+    @property
+    def filter_in_words(self) -> str:
+        """Which safety filter is on: ``announce + obstacles``."""
+        scenario = self.scenario
+        levels = [scenario.safety_filter] if scenario.safety_filter != "off" else []
+        return " + ".join(levels + ["obstacles"] * scenario.obstacle_filter) or "off"
 
     def step(self) -> None:
         """Simulate one step."""
@@ -123,10 +138,11 @@ class Game:
         picture = pygame.Surface((SIDE + _PANEL, HEADER + SIDE))
         picture.fill("white")
         picture.blit(self.renderer.draw_surface(self.world), (0, 0))
-        for line, text in enumerate(_HELP):
+        lines = (*_HELP, f"f: {self._filter_error or f'filter {self.filter_in_words}'}")
+        for line, text in enumerate(lines):
             picture.blit(self._font.render(text, True, (60, 60, 60)), (SIDE, 12 + 18 * line))
         if self.watched is not None:
-            self._draw_channels(picture, 12 + 18 * len(_HELP))
+            self._draw_channels(picture, 12 + 18 * len(lines))
         return picture
 
     # -- what events do ----------------------------------------------------------------------------------------------
@@ -148,6 +164,14 @@ class Game:
 
     def _quit(self) -> None:
         self.is_over = True
+
+    def _switch_filter(self) -> None:
+        off = {"safety_filter": "off", "obstacle_filter": False}
+        try:
+            self.scenario = self.scenario.replace(**(off if self.scenario.is_filtered else self._filter))
+            self.world.scenario = self.current_scenario
+        except SettingsError:
+            self._filter_error = "ranges too short for a filter"
 
     def _watch_next(self) -> None:
         following = 0 if self.watched is None else self.watched + 1

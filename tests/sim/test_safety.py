@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sb3_flock.envs import flocking_v0
+from sb3_flock.serialization.yaml_io import load_config, parse_overrides
 from sb3_flock.settings import SettingsError
 from sb3_flock.sim import Scenario, World, episode_rng, safety
 from sb3_flock.sim.safety import filter_actions
@@ -108,6 +109,12 @@ def test_the_obstacle_filter_leaves_the_worst_obstacle_its_part_of_the_gap():
 def test_settings_that_cannot_hold_are_one_line(fields, message):
     with pytest.raises(SettingsError, match=message):
         Scenario(**fields)
+
+
+def test_off_may_be_written_without_quotes():
+    """YAML reads it as false."""
+    overrides = parse_overrides(["safety_filter=off"])
+    assert load_config(Scenario, overrides=overrides, base=Scenario(safety_filter="voronoi")).safety_filter == "off"
 
 
 def test_sensing_that_reaches_just_far_enough_is_accepted():

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image, ImageGrab
 
 from sb3_flock.cli import main
-from sb3_flock.controllers import make_controller
+from sb3_flock.controllers import Controller, make_controller
 from sb3_flock.envs.rendering import HEADER, SIDE, Renderer
 from sb3_flock.serialization.load import load_policy
 from sb3_flock.settings import SettingsError
@@ -93,6 +93,64 @@ def test_pause_step_and_new_episode(game):
     assert not np.array_equal(game.world.positions, here)
     press(game, pygame.K_q)
     assert game.is_over
+
+
+def head_on(game):
+    """Two vehicles at their separation that head for each other."""
+    game.world.positions, game.world.headings = np.array([[(0.0, 0.0), (0.1, 0.0)]]), np.array([[0.0, -np.pi]])
+    game.sensing = game.world.sense()
+    game.step()
+    return np.linalg.norm(game.world.positions[0, 1] - game.world.positions[0, 0])
+
+
+class FullSpeed(Controller):
+    """Drives straight ahead."""
+
+    def act(self, sensing, scenario):
+        return np.full((*sensing.waypoint_distances.shape, 2), (scenario.max_speed, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"safety_filter": "heading"}, "heading"),
+        ({"safety_filter": "voronoi", "obstacle_filter": True}, "voronoi + obstacles"),
+    ],
+)
+def test_the_filter_of_the_scenario_acts_and_a_key_switches_it(fields, words):
+    game = Game(FullSpeed(), Scenario(n_vehicles=2, n_obstacles=1, **fields))
+    on = pygame.surfarray.array3d(game.draw())
+    assert game.caption == f"sb3_flock: 2 vehicles, 1 obstacle, safety filter {words}"
+    assert head_on(game) == 0.1
+    press(game, pygame.K_f)
+    assert game.caption == "sb3_flock: 2 vehicles, 1 obstacle"
+    assert (pygame.surfarray.array3d(game.draw())[SIDE:] != on[SIDE:]).any()  # the panel says so, too
+    assert head_on(game) == pytest.approx(0.07)
+    press(game, pygame.K_r)
+    assert not game.world.scenario.is_filtered
+    press(game, pygame.K_f)
+    press(game, pygame.K_r)
+    assert head_on(game) == 0.1
+    assert (game.filter_in_words, game.world.scenario.is_filtered) == (words, True)
+
+
+def test_a_key_switches_a_filter_on_where_the_scenario_has_none():
+    game = Game(FullSpeed(), Scenario(n_vehicles=2, n_obstacles=1))
+    assert head_on(game) == pytest.approx(0.07)
+    press(game, pygame.K_f)
+    assert head_on(game) == 0.1
+    assert "safety filter announce" in game.caption
+    press(game, pygame.K_MINUS)
+    press(game, pygame.K_PLUS, "+")
+    assert head_on(game) == 0.1
+
+
+def test_a_filter_that_cannot_be_on_stays_off():
+    game = Game(FullSpeed(), Scenario(n_vehicles=2, n_obstacles=1, link_range=0.12))
+    before = pygame.surfarray.array3d(game.draw())
+    press(game, pygame.K_f)
+    assert game.filter_in_words == "off"
+    assert (pygame.surfarray.array3d(game.draw())[SIDE:] != before[SIDE:]).any()
 
 
 def test_the_observation_of_each_vehicle_is_shown_in_turn(game):

@@ -15,6 +15,7 @@ from sb3_flock.viz.video import render
 from tests.browser import Browser
 
 SCENARIO = Scenario(max_cycles=30)
+_, _, _, _, _, VIOLATION, _, _ = PALETTE
 
 
 @pytest.fixture
@@ -35,6 +36,20 @@ def test_a_gif_moves_in_the_time_it_should(tmp_path, controller):
     for color in PALETTE:
         assert (np.abs(first.astype(int) - color).max(-1) < 12).any()
     assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("safety_filter", ["off", "voronoi"])
+def test_the_filter_of_the_scenario_acts(safety_filter, tmp_path, controller):
+    """Vehicles that violate their separation are drawn in another color; the filter leaves none."""
+    scenario = Scenario(n_vehicles=6, n_obstacles=0, arena=0.4, max_cycles=60, safety_filter=safety_filter)
+    with Image.open(render(controller, scenario, tmp_path / "episode.gif")) as video:
+        violations = 0
+        for frame in range(video.n_frames):
+            video.seek(frame)
+            picture = np.asarray(video.convert("RGB"))[HEADER:].astype(int)
+            violations += (np.abs(picture - VIOLATION).max(-1) < 12).sum()
+    assert (violations > 100) == (safety_filter == "off")
+    assert violations == 0 or safety_filter == "off"
 
 
 @pytest.mark.parametrize(("speed", "frames", "fps"), [(1.0, 31, 10), (20.0, 8, 50)])

@@ -1,0 +1,132 @@
+"""The check of an exported graph: random sample inputs, and its comparison with the policy and the world's filter."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sb3_flock.sim import Scenario, Sensing, World, episode_rng, observe
+from sb3_flock.sim.safety import filter_actions
+from sb3_flock.sim.sensing import find_contacts
+from sb3_flock.sim.sensors import SensorErrors
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+    from sb3_flock.serialization.load import LoadedPolicy
+
+SampleInput = dict[str, "NDArray[np.float64]"]
+"""The inputs of the graph by name."""
+
+
+@dataclass(frozen=True)
+class _Sample:
+    """A random state of a flock, as its first vehicle measures it and as the world has it."""
+
+    inputs: SampleInput
+    sensing: Sensing
+    frames: NDArray[np.float64]
+    asked: NDArray[np.float64]
+    """What the vehicles ask for, ``(1, vehicles, 2)``."""
+
+
+def compare(session: Any, policy: LoadedPolicy, scenario: Scenario, n_samples: int, seed: int) -> tuple[float, float]:
+    """Largest difference of a graph to ``predict``, as a share of the action's range, and median time of a decision [s].
+
+    With a filter the difference is that to the filtered action, and to the speed to announce.
+
+    :param session: an ``onnxruntime.InferenceSession`` of the graph
+    """
+    space: Any = policy.policy.action_space
+    width, outputs, times, differences = space.high - space.low, [], [], []
+    samples = list(_random_samples(scenario, n_samples, seed))
+    for sample in samples:
+        start = time.perf_counter()
+        outputs.append(decide(session, sample.inputs))
+        times.append(time.perf_counter() - start)
+    for sample, (action, *announced) in zip(samples, outputs, strict=True):
+        asked = policy.predict(observe(sample.sensing, scenario)[0, 0], deterministic=True)[0]
+        expected, announcement = _executed(sample, asked, scenario)
+        differences += [(np.abs(action - expected) / width).max()]
+        differences += [np.abs(speed - announcement) / width[0] for speed in announced]
+    return float(max(differences)), float(np.median(times))
+
+
+def decide(session: Any, inputs: SampleInput) -> list[NDArray[np.float64]]:
+    """The outputs of a graph. With ``announce`` it is run twice, as on board: first without announcements."""
+    if "neighbor_announced_speeds" in inputs:
+        silent = {**inputs, "neighbor_announced_speeds": np.zeros_like(inputs["neighbor_announced_speeds"])}
+        (announced,) = session.run(["announced_speed"], silent)
+        (action,) = session.run(["action"], inputs)
+        return [action, announced]
+    return session.run(None, inputs)
+
+
+def random_sample_inputs(scenario: Scenario, count: int, seed: int) -> Iterator[tuple[SampleInput, NDArray[np.float32]]]:
+    """What one vehicle measures at the start of random episodes of all sizes, and its observation there.
+
+    With motion channels, ``motion_lag`` after the start, with random actions. With a filter the neighbors' headings and
+    announced speeds are among the inputs where it needs them.
+    """
+    for sample in _random_samples(scenario, count, seed):
+        yield sample.inputs, observe(sample.sensing, scenario)[0, 0]
+
+
+def _random_samples(scenario: Scenario, count: int, seed: int) -> Iterator[_Sample]:
+    for number in range(count):
+        rng = episode_rng(seed, number)
+        n_vehicles, n_obstacles = int(rng.integers(1, 13)), int(rng.integers(0, 6))
+        bodies = {"n_vehicles": n_vehicles, "n_obstacles": n_obstacles, "obstacle_motion": "walk"}
+        arena = max(scenario.link_range, scenario.detection_range) * rng.uniform(2, 5)
+        free_space = {"arena": arena, "obstacle_arena": arena, "obstacle_starts": None, "sensors": SensorErrors()}
+        world = World(scenario.replace(**bodies, **free_space, max_cycles=max(1, scenario.motion_lag_steps)))
+        sensing = world.sensors.measure(world.reset([rng]))
+        inputs = _measured_by_first_vehicle(world, sensing)
+        if scenario.motion_lag:
+            before = {f"previous_{name}": positions for name, positions in inputs.items()}
+            (x, y), (cos, sin), heading = world.positions[0, 0], world.frames[0, 0], world.headings[0, 0]
+            for _ in range(scenario.motion_lag_steps):
+                actions = rng.uniform(world.action_low, world.action_high, (1, n_vehicles, 2))
+                sensing = world.sensors.measure(world.step(actions)[0])
+            dx, dy = world.positions[0, 0] - (x, y)
+            ego_motion = np.array([cos * dx + sin * dy, cos * dy - sin * dx, world.headings[0, 0] - heading])
+            inputs = {**_measured_by_first_vehicle(world, sensing), **before, "ego_motion": ego_motion}
+        asked = rng.uniform(world.action_low, world.action_high, (1, n_vehicles, 2))
+        if scenario.safety_filter in {"heading", "announce"}:
+            inputs["neighbor_headings"] = world.headings[0, 1:] - world.headings[0, 0]
+        if scenario.safety_filter == "announce":
+            inputs["neighbor_announced_speeds"] = _announced(asked, sensing, scenario, world.frames)[1:]
+        yield _Sample(inputs, sensing, world.frames, asked)
+
+
+def _executed(sample: _Sample, action: NDArray[np.float32], scenario: Scenario) -> tuple[NDArray[np.float64], float]:
+    """What the first vehicle executes if it asks for an action, as in ``World.step``, and which speed it announces."""
+    asked, low, high = sample.asked.copy(), (0.0, -scenario.max_turn_rate), (scenario.max_speed, scenario.max_turn_rate)
+    asked[0, 0] = np.clip(action, low, high)
+    measured = sample.sensing, scenario, sample.frames
+    return filter_actions(asked, *measured)[0, 0], _announced(asked, *measured)[0]
+
+
+def _announced(
+    asked: NDArray[np.float64], sensing: Sensing, scenario: Scenario, frames: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """The speeds that the vehicles announce, ``(vehicles,)``: those that ``heading`` admits."""
+    admitted = scenario if scenario.safety_filter == "off" else scenario.replace(safety_filter="heading")
+    return filter_actions(asked, sensing, admitted, frames)[0, :, 0]
+
+
+def _measured_by_first_vehicle(world: World, sensing: Sensing) -> SampleInput:
+    """Positions of all bodies in the first vehicle's frame, in range or not."""
+    neighbors, obstacles = (
+        found.positions[found.observers == 0]
+        for found in (
+            find_contacts(world.positions, world.frames, world.positions, np.inf, exclude_self=True),
+            find_contacts(world.positions, world.frames, world.obstacle_positions, np.inf),
+        )
+    )
+    return {"neighbors": neighbors, "obstacles": obstacles, "waypoint": sensing.waypoint_positions[0, 0]}
