@@ -121,12 +121,10 @@ def _announced(
 
 
 def _measured_by_first_vehicle(world: World, sensing: Sensing) -> SampleInput:
-    """Positions of all bodies in the first vehicle's frame, in range or not."""
-    neighbors, obstacles = (
-        found.positions[found.observers == 0]
-        for found in (
-            find_contacts(world.positions, world.frames, world.positions, np.inf, exclude_self=True),
-            find_contacts(world.positions, world.frames, world.obstacle_positions, np.inf),
-        )
-    )
-    return {"neighbors": neighbors, "obstacles": obstacles, "waypoint": sensing.waypoint_positions[0, 0]}
+    """Positions in the first vehicle's frame: of all bodies, in range or not; with shared detections, of known obstacles."""
+    neighbors = find_contacts(world.positions, world.frames, world.positions, np.inf, exclude_self=True)
+    obstacles = sensing.obstacles
+    if not world.scenario.shared_detections:
+        obstacles = find_contacts(world.positions, world.frames, world.obstacle_positions, np.inf)
+    own = (found.positions[found.observers == 0] for found in (neighbors, obstacles))
+    return {**dict(zip(("neighbors", "obstacles"), own, strict=True)), "waypoint": sensing.waypoint_positions[0, 0]}

@@ -116,7 +116,7 @@ class OnnxPolicy(nn.Module):
         """The channels ``(channels, l, l)`` of one measurement, all at once for speed: bodies carry their channel's number,
         lengths are in units of its sigma."""
         scenario, side = self.scenario, self.scenario.n_anchors
-        ranges = {"neighbors": scenario.link_range, "obstacles": scenario.detection_range}
+        ranges = {"neighbors": scenario.link_range, "obstacles": scenario.known_obstacle_range}
         marked, shown = [], []
         for number, (channel, radius) in enumerate(zip(scenario.channels, scenario.channel_radii, strict=True)):
             measured = bodies[channel.source]
@@ -298,8 +298,18 @@ _INPUTS_OF_LEVELS = {
 
 
 def _metadata(policy: LoadedPolicy, scenario: Scenario) -> dict[str, Any]:
-    names = ("link_range", "detection_range", "neighbor_separation", "obstacle_separation", "time_step", "max_speed")
+    names = (
+        "link_range",
+        "detection_range",
+        "shared_detections",
+        "neighbor_separation",
+        "obstacle_separation",
+        "time_step",
+        "max_speed",
+    )
     inputs = "positions in the body frame [m], forward +x, left +y: neighbors (any, 2), obstacles (any, 2), waypoint (2,)"
+    if scenario.shared_detections:
+        inputs += "; obstacles are those that the vehicle or one of its neighbors detects"
     if scenario.motion_lag:
         inputs += "; previous_...: those of motion_lag [s] ago, in the frame of that time"
         inputs += "; ego_motion (3,): present position in that frame [m], turn since [rad]"

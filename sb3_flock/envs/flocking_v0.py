@@ -236,14 +236,16 @@ class parallel_env(ParallelEnv[str, Observation, Action]):  # noqa: N801 - Petti
     def _advance(self, commands: NDArray[np.float64]) -> tuple[Sensing, dict[str, NDArray[np.float64]]]:
         """Take the world's steps of one step: what is sensed at the end, and the means of the reward's terms."""
         steps = min(self.action_repeat, self.scenario.max_cycles - self.world.steps)
-        totals: dict[str, NDArray[np.float64]] = {}
-        for number in range(max(steps, 1)):  # after the last step the world says that no episode is running
-            if number:
-                self.world.sensors.measure(sensing)  # the sensors remember every sampling period
-            sensing, executed = self.world.step(commands)
-            terms = reward_terms(sensing, executed, self.scenario.reward, self.scenario)
-            totals = {name: totals[name] + term for name, term in terms.items()} if number else terms
+        sensing, totals = self._advance_once(commands)
+        for _ in range(steps - 1):
+            self.world.sensors.measure(sensing)  # the sensors remember every sampling period
+            sensing, terms = self._advance_once(commands)
+            totals = {name: totals[name] + term for name, term in terms.items()}
         return sensing, {name: total / steps for name, total in totals.items()} if steps > 1 else totals
+
+    def _advance_once(self, commands: NDArray[np.float64]) -> tuple[Sensing, dict[str, NDArray[np.float64]]]:
+        sensing, executed = self.world.step(commands)
+        return sensing, reward_terms(sensing, executed, self.scenario.reward, self.scenario)
 
     def _observations(self, sensing: Sensing) -> dict[str, Observation]:
         observations = observe(self.measure(sensing), self.scenario)

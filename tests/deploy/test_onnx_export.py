@@ -68,6 +68,7 @@ def test_the_file_holds_what_a_vehicle_needs(exported):
         {"algo": "sac"},
         {"algo": "td3", "network.action_bound": "tanh", "scenario.n_anchors": 15},
         {"motion_lag": 0.2},
+        {"motion_lag": 0.2, "shared_detections": True, "obstacle_radius": 0.35},
         {"motion_lag": 2.0, "obstacle_starts": [[0.5, 0.5]], "sensors.delay": 0.2},
     ],
 )
