@@ -113,6 +113,14 @@ class TaskConfig(Settings):
         sizes = train_env.flock_sizes or (scenario.n_vehicles,)
         return [motion.replace(n_vehicles=size) for motion in motions for size in sizes]
 
+    def training_safety(self, scenario: Scenario) -> Scenario:
+        """The settings of the safety filter for one of :meth:`training_scenarios`: it keeps the task's separations.
+
+        The wider ones are for the reward and the expert. The filter would hold vehicles that keep just those.
+        """
+        task = self.scenario
+        return scenario.replace(neighbor_separation=task.neighbor_separation, obstacle_separation=task.obstacle_separation)
+
 
 class TrainingConfig(ModelSettings, TaskConfig):
     """A training: the task, the algorithm, the networks and the bookkeeping.

@@ -77,9 +77,10 @@ class MPC(Controller):
             self.config.clearance_weight,
             self.config.link_weight,
         )
-        level = scenario.safety_filter
+        safety = world.safety
+        level = safety.safety_filter
         self._filter = FilterParams(
-            (scenario.neighbor_separation + scenario.safety_margin) / self._unit,
+            (safety.neighbor_separation + safety.safety_margin) / self._unit,
             {"off": 0, "announce": 2}.get(level, 1),
             level != "voronoi",
         )

@@ -16,6 +16,8 @@ from sb3_flock.sim import Scenario, Sensing, World
 if TYPE_CHECKING:
     from typing_extensions import Self
 
+    from sb3_flock.sim.safety import SafetySettings
+
 
 class ExpertEnv(parallel_env):
     """:class:`~sb3_flock.envs.flocking_v0.parallel_env` with an expert, as in DAgger's interactive collection.
@@ -35,6 +37,7 @@ class ExpertEnv(parallel_env):
     :param queries: put ``expert_action`` into every info; otherwise the expert acts only for the flocks that it drives
     :param n_flocks: number of independent flocks
     :param action_repeat: sampling periods that a step takes, with the same actions
+    :param safety: the filters and their separations, if they are not the scenario's
     """
 
     def __init__(
@@ -46,10 +49,11 @@ class ExpertEnv(parallel_env):
         queries: bool = False,
         n_flocks: int = 1,
         action_repeat: int = 1,
+        safety: SafetySettings | None = None,
     ) -> None:
-        super().__init__(scenario, n_flocks=n_flocks, action_repeat=action_repeat)
+        super().__init__(scenario, n_flocks=n_flocks, action_repeat=action_repeat, safety=safety)
         acts_for_all = queries or n_flocks == 1
-        self._seen = self.world if acts_for_all else World(scenario)
+        self._seen = self.world if acts_for_all else World(scenario, safety=safety)
         self.expert, self.fraction, self.noise_std, self.queries = make_expert(self._seen), fraction, noise_std, queries
         self._drives = np.zeros(n_flocks, bool)
         self._expert_actions: NDArray[np.floating] | None = None

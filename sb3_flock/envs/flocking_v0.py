@@ -58,6 +58,8 @@ from sb3_flock.sim.sensing import is_connected, nearest
 if TYPE_CHECKING:
     from typing_extensions import Self
 
+    from sb3_flock.sim.safety import SafetySettings
+
 Observation = NDArray[np.float32]
 Action = NDArray[np.float32]
 
@@ -92,6 +94,7 @@ class parallel_env(ParallelEnv[str, Observation, Action]):  # noqa: N801 - Petti
     :param render_mode: ``None``, ``"human"`` or ``"rgb_array"``; the first flock is drawn
     :param n_flocks: number of independent flocks
     :param action_repeat: sampling periods that a step takes, with the same actions; rewards are means over them
+    :param safety: the filters and their separations, if they are not the scenario's; ``fields`` do not change it
     :param fields: fields of :class:`~sb3_flock.Scenario` by name
     :raises SettingsError: for an unknown field, a value that is not accepted or an unknown render mode
 
@@ -112,6 +115,7 @@ class parallel_env(ParallelEnv[str, Observation, Action]):  # noqa: N801 - Petti
         render_mode: str | None = None,
         n_flocks: int = 1,
         action_repeat: int = 1,
+        safety: SafetySettings | None = None,
         **fields: Any,
     ) -> None:
         check_integer("n_flocks", n_flocks, least=1)
@@ -129,7 +133,7 @@ class parallel_env(ParallelEnv[str, Observation, Action]):  # noqa: N801 - Petti
         self.agents: list[str] = []
         self._observation_spaces = {name: observation_space(self.scenario) for name in vehicles}
         self._action_spaces = {name: action_space(self.scenario) for name in vehicles}
-        self.world = World(self.scenario, n_flocks)
+        self.world = World(self.scenario, n_flocks, safety)
         self.rngs: list[np.random.Generator] = []
         self._renderer: Any = None
 
@@ -199,7 +203,7 @@ class parallel_env(ParallelEnv[str, Observation, Action]):  # noqa: N801 - Petti
         if self.n_copies == 1:
             return self
         one = copy.copy(self)
-        one.n_copies, one.world, one._renderer = 1, World(self.scenario), None
+        one.n_copies, one.world, one._renderer = 1, World(self.scenario, safety=self.world.safety), None
         one.possible_agents = list(self._action_spaces)
         one.rngs = copy.deepcopy(self.rngs[index : index + 1])
         one.agents = list(one.possible_agents) if self.agents else []

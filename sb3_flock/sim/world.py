@@ -99,6 +99,7 @@ class World:
 
     :param scenario: the task, a :class:`~sb3_flock.sim.Scenario`
     :param n_flocks: number of flocks, at least 1
+    :param safety: the filters and their separations, if they are not the scenario's
     """
 
     positions: NDArray[np.float64]
@@ -116,8 +117,8 @@ class World:
     steps: int
     """Steps taken since the reset, k."""
 
-    def __init__(self, scenario: WorldSettings, n_flocks: int = 1) -> None:
-        self.scenario = scenario
+    def __init__(self, scenario: WorldSettings, n_flocks: int = 1, safety: SafetySettings | None = None) -> None:
+        self.scenario, self._safety = scenario, safety
         self.n_flocks = n_flocks
         self.sensors = Sensors(scenario)
         self.steps = scenario.max_cycles  # no episode is running before the first reset
@@ -127,6 +128,11 @@ class World:
         shape = (n_flocks, scenario.n_vehicles, 2)
         self._one_step = np.ones((n_flocks, 1))
         self._bounds = [np.broadcast_to(bound, shape).copy() for bound in (self.action_low, self.action_high)]
+
+    @property
+    def safety(self) -> SafetySettings:
+        """The settings of the safety filter."""
+        return self._safety or self.scenario
 
     @property
     def headings(self) -> NDArray[np.float64]:
@@ -185,17 +191,17 @@ class World:
         :return: what the vehicles sense afterwards, and the executed actions: clipped, and filtered where the scenario says so
         :raises RuntimeError: before a reset or after the episode's last step
         """
-        scenario = self.scenario
-        if self.steps >= scenario.max_cycles:
+        safety = self.safety
+        if self.steps >= self.scenario.max_cycles:
             raise RuntimeError("no episode is running: call reset() first")
         low, high = self._bounds
         executed = np.minimum(np.maximum(np.asarray(actions, dtype=np.float64), low), high)
-        if scenario.is_filtered:
-            executed = filter_actions(executed, self.sensors.latest or self.sense(), scenario, self.frames)
+        if safety.is_filtered:
+            executed = filter_actions(executed, self.sensors.latest or self.sense(), safety, self.frames)
         self.sensors.latest = None
         self._move(executed)
         self.steps += 1
-        return self.sense(executed * scenario.time_step), executed
+        return self.sense(executed * self.scenario.time_step), executed
 
     def state_dict(self) -> dict[str, Any]:
         """The current episode: everything its next steps depend on besides the actions."""

@@ -192,9 +192,9 @@ def make_training_env(config: TrainingConfig) -> ParameterSharingVecEnv:
 
 
 def _make_flocks(config: TrainingConfig, scenario: Scenario, n_flocks: int) -> parallel_env:
-    train_env = config.train_env
+    train_env, safety = config.train_env, config.training_safety(scenario)
     if train_env.expert is None:
-        return parallel_env(scenario, n_flocks=n_flocks, action_repeat=train_env.action_repeat)
+        return parallel_env(scenario, n_flocks=n_flocks, action_repeat=train_env.action_repeat, safety=safety)
     make_expert = EXPERTS[train_env.expert]
     return ExpertEnv(
         scenario,
@@ -204,6 +204,7 @@ def _make_flocks(config: TrainingConfig, scenario: Scenario, n_flocks: int) -> p
         queries=config.algorithm.bc_coef > 0,
         n_flocks=n_flocks,
         action_repeat=train_env.action_repeat,
+        safety=safety,
     )
 
 
