@@ -125,3 +125,13 @@ def test_names_of_the_previous_release_warn_and_work():
 def test_a_config_is_importable_without_torch():
     code = "import sys; from sb3_flock import TrainingConfig; TrainingConfig(); sys.exit('torch' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_the_filter_of_a_training_env_keeps_the_tasks_separations():
+    config = load_config(TrainingConfig, overrides={"separation_scale": 1.2, "safety_margin": 0.01, "n_vehicles": 7})
+    (scenario,) = config.training_scenarios()
+    safety = config.training_safety(scenario)
+    assert scenario.neighbor_separation == pytest.approx(0.12)
+    assert (safety.neighbor_separation, safety.obstacle_separation, safety.safety_margin) == (0.1, 0.15, 0.01)
+    same = {"neighbor_separation", "obstacle_separation"}
+    assert all(getattr(safety, name) == getattr(scenario, name) for name in set(type(safety).model_fields) - same)

@@ -14,7 +14,7 @@ from sb3_flock.rl.registry import ALGORITHMS
 from sb3_flock.serialization.load import PolicyError
 from sb3_flock.serialization.yaml_io import load_config
 from sb3_flock.settings import UserError
-from sb3_flock.training.train import cores
+from sb3_flock.training.train import cores, make_training_env
 from tests.helpers import quiet, tiny
 
 
@@ -225,3 +225,20 @@ def test_what_cannot_be_used_is_refused_in_one_line(changes, message, tmp_path):
         train(tiny(tmp_path, **changes), quiet())
     assert "\n" not in str(error.value)
     assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize("expert", [None, "orca"])
+def test_in_training_the_filter_keeps_the_tasks_separations_and_the_reward_counts_wider_ones(tmp_path, expert):
+    changes = {"n_vehicles": 6, "n_obstacles": 0, "arena": 0.3, "safety_filter": "voronoi", "separation_scale": 1.2}
+    changes |= {"time_step_scale": 1.0, "action_repeat": 2, "flock_sizes": None, "expert": expert, "expert_fraction": 0.0}
+    env = make_training_env(tiny(tmp_path, **changes))
+    env.reset()
+    rng, nearest, penalized = np.random.default_rng(0), [], []
+    for _ in range(100):
+        turns = rng.uniform(-np.pi, np.pi, env.num_envs)
+        infos = env.step(np.stack((np.full(env.num_envs, 0.15), turns), axis=-1).astype(np.float32))[-1]
+        nearest += [info["metrics"]["nearest_neighbor"] for info in infos]
+        penalized += [info["reward_terms"]["connectivity"] < 0 for info in infos]
+    env.close()
+    assert 0.1 <= min(nearest) < 0.12
+    assert any(penalized)
