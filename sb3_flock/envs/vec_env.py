@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 from supersuit.vector.concat_vec_env import ConcatVecEnv
-from supersuit.vector.markov_vector_wrapper import MarkovVectorEnv
 from supersuit.vector.multiproc_vec import ProcConcatVec
 from supersuit.vector.sb3_vector_wrapper import SB3VecEnvWrapper
 
 from sb3_flock._compat import copies_in_process, is_multiprocess, reset_workers
 from sb3_flock.envs import flocking_v0
+from sb3_flock.envs.flat_env import RESET_INFO, FlatEnv, check_parallel_env, without_black_death
 from sb3_flock.envs.multi_flock import MultiFlockEnv
 from sb3_flock.settings import RunError, SettingsError, check_integer
 from sb3_flock.sim import Scenario
@@ -71,7 +71,7 @@ def flatten_batch(
     share = -(-n_copies // max(num_cpus, 1))
     if share == n_copies:
         return flatten(make_env(n_copies), seed=seed)
-    example = supersuit.pettingzoo_env_to_vec_env_v1(make_env(1))
+    example = FlatEnv(make_env(1))
     workers = [
         partial(_flat, make_env, min(share, n_copies - first)) for first in range(0, n_copies, share)
     ]  # the last one may have fewer copies, which SuperSuit's own constructor does not provide for
@@ -82,25 +82,29 @@ def flatten_batch(
     return adapter
 
 
-def _flat(make_env: Callable[[int], ParallelEnv], n_copies: int) -> MarkovVectorEnv:
-    return supersuit.pettingzoo_env_to_vec_env_v1(make_env(n_copies))
+def _flat(make_env: Callable[[int], ParallelEnv], n_copies: int) -> FlatEnv:
+    return FlatEnv(make_env(n_copies))
 
 
 def flatten(env: ParallelEnv, n_copies: int = 1, num_cpus: int = 0, seed: int | None = None) -> ParameterSharingVecEnv:
     """Any PettingZoo parallel env whose agents share their spaces, copied and flattened into one SB3 vector env.
 
-    :param env: the env; all agents of an episode must live until its end
+    Agents may die or join in any step; :class:`~sb3_flock.envs.flat_env.FlatEnv` says what their slots then show.
+
+    :param env: the env; SuperSuit's ``black_death_v3`` around it is not needed, and has no effect
     :param n_copies: number of independent copies
     :param num_cpus: worker processes; 0 and 1 keep everything in this process
     :param seed: seeds all copies, each with a stream of its own
-    :raises SettingsError: for a count that is not accepted
+    :raises SettingsError: for a count that is not accepted, something else than a parallel env, or agents that differ in a
+        space
     """
     check_integer("n_copies", n_copies, least=1)
     check_integer("num_cpus", num_cpus, least=0)
+    check_parallel_env(env)
     if n_copies > 1 and getattr(env.unwrapped, "n_copies", 1) > 1:
         raise SettingsError(f"n_copies = {n_copies}: 1 is needed for an env that holds several copies itself")
-    flat = supersuit.pettingzoo_env_to_vec_env_v1(env)
-    vec_env = supersuit.concat_vec_envs_v1(flat, n_copies, num_cpus=num_cpus, base_class="gymnasium")
+    env = without_black_death(env)
+    vec_env = supersuit.concat_vec_envs_v1(FlatEnv(env), n_copies, num_cpus=num_cpus, base_class="gymnasium")
     adapter = ParameterSharingVecEnv(vec_env, env)
     adapter.seed(seed)
     return adapter
@@ -110,8 +114,9 @@ class ParameterSharingVecEnv(SB3VecEnvWrapper):
     """SuperSuit's SB3 wrapper with its defects fixed; use :func:`make_vec_env` or :func:`flatten` to build one.
 
     What it adds: seeds that reproduce and that differ between copies, with and without workers; ``TimeLimit.truncated``
-    wherever an episode is cut and not ended; boolean ``dones``; SB3's ``get_attr``, ``set_attr`` and ``env_method`` (without
-    workers); ``render_mode`` through wrappers and workers; one clear error when a worker dies, and workers that close.
+    wherever an episode is cut and not ended; boolean ``dones``; agents that die or join; ``reset_infos``, also of automatic
+    resets; SB3's ``get_attr``, ``set_attr`` and ``env_method`` (without workers); ``render_mode`` through wrappers and
+    workers; one clear error when a worker dies, and workers that close.
 
     Where one env simulates several copies in a batch, ``get_attr`` and ``env_method`` show each copy alone
     (:meth:`~sb3_flock.envs.flocking_v0.parallel_env.copy_at`); what they change in it has no effect on the batch.
@@ -123,7 +128,7 @@ class ParameterSharingVecEnv(SB3VecEnvWrapper):
         self._copies_per_env = getattr(example.unwrapped, "n_copies", 1)
         self.n_agents = len(example.possible_agents) // self._copies_per_env
         if is_multiprocess(venv):
-            venv.render_mode = example.unwrapped.render_mode
+            venv.render_mode = getattr(example.unwrapped, "render_mode", None)
         super().__init__(venv)
         self.metadata = venv.metadata
         self.reset_infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
@@ -182,8 +187,11 @@ class ParameterSharingVecEnv(SB3VecEnvWrapper):
             observations, rewards, terminations, truncations, infos = self.venv.step_wait()
         terminations, truncations = np.asarray(terminations, dtype=bool), np.asarray(truncations, dtype=bool)
         dones = terminations | truncations
-        for slot in np.flatnonzero(dones):
-            infos[slot] = {**infos[slot], "TimeLimit.truncated": bool(truncations[slot] and not terminations[slot])}
+        for slot, info in enumerate(infos):
+            if RESET_INFO in info:
+                self.reset_infos[slot] = info.pop(RESET_INFO)
+        for slot in np.flatnonzero(dones).tolist():
+            infos[slot]["TimeLimit.truncated"] = bool(truncations[slot] and not terminations[slot])
         return observations, rewards, dones, infos
 
     @contextmanager

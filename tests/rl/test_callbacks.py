@@ -18,6 +18,7 @@ from sb3_flock.rl.callbacks import (
     StoreExecutedActions,
 )
 from sb3_flock.settings import SettingsError
+from tests.envs.scripted import Scripted
 
 CROWDED = Scenario(n_vehicles=4, n_obstacles=1, arena=0.2, obstacle_arena=0.4, neighbor_separation=0.02, max_cycles=5)
 
@@ -87,6 +88,13 @@ def test_neighbors_at_the_end_of_an_episode_are_those_of_its_last_step():
     for info in infos:
         assert (len(info["neighbors"]) > 0) == (info["terminal_observation"][0].max() > 0)
     np.testing.assert_allclose(model.replay_buffer.rewards[4], expected_mix(infos, 4, 0.5), rtol=1e-5)
+
+
+def test_neighbors_in_a_resets_infos_are_not_those_of_the_last_step():
+    env = flatten(Scripted(dict.fromkeys("abcd", (0, 3, "truncation"))), 2, seed=0)  # a reset names d, each step a
+    model = learn(env, NeighborInclusiveReward(0.5), 7)
+    mixed = np.tile(0.5 * np.array([10, 20, 30, 40]) + 0.5 * 10, 2)
+    np.testing.assert_array_equal(model.replay_buffer.rewards[:7], np.tile(mixed, (7, 1)))
 
 
 def test_mixed_rewards_with_n_step_returns():
