@@ -6,17 +6,13 @@ import copy
 from collections.abc import Mapping
 from typing import Any
 
-import gymnasium
 import numpy as np
 from gymnasium.vector.utils import create_empty_array, iterate
 from numpy.typing import NDArray
-from pettingzoo import AECEnv, ParallelEnv
-from pettingzoo.utils.wrappers import BaseParallelWrapper
-from stable_baselines3.common.vec_env import VecEnv
-from supersuit.multiagent_wrappers.black_death import black_death_par
+from pettingzoo import ParallelEnv
 from supersuit.vector.markov_vector_wrapper import MarkovVectorEnv
 
-from sb3_flock.settings import RunError, SettingsError, format_value
+from sb3_flock.settings import RunError
 
 RESET_INFO = "sb3_flock/reset_info"
 """Key of a last step's info under which the next episode's reset info is passed on."""
@@ -33,7 +29,7 @@ class FlatEnv(MarkovVectorEnv):
       longer among the env's agents, without a flag, is truncated.
     * Where no agent acts, the slot's action is ignored, its observation and reward are 0, and it does not end.
 
-    :param par_env: the env; :func:`check_parallel_env` says what is accepted
+    :param par_env: the env; :func:`~sb3_flock.envs.wrappers.check_parallel_env` says what is accepted
     """
 
     def __init__(self, par_env: ParallelEnv) -> None:
@@ -94,52 +90,3 @@ class FlatEnv(MarkovVectorEnv):
         else:
             next_observations = self.concat_obs(observations)
         return next_observations, rewards, terminations, truncations, infos
-
-
-def check_parallel_env(env: Any) -> None:
-    """Check that an env can be flattened.
-
-    :raises SettingsError: if it is no PettingZoo parallel env, or its agents differ in a space
-    """
-    if not isinstance(env, ParallelEnv):
-        raise SettingsError(f"env = {format_value(env)}: a PettingZoo parallel env is needed{_hint(env)}")
-    if not getattr(env, "possible_agents", None):
-        raise SettingsError("env has no possible_agents: each of them gets a slot of the vector env")
-    for kind in ("observation_space", "action_space"):
-        first, *others = env.possible_agents
-        space = getattr(env, kind)(first)
-        for agent in others:
-            if getattr(env, kind)(agent) != space:
-                raise SettingsError(
-                    f"env: {kind} of {first} and of {agent} differ, and all agents share one policy; SuperSuit's "
-                    f"pad_{kind.split('_')[0]}{'s' if kind[0] == 'o' else '_space'}_v0 makes them equal"
-                )
-
-
-def _hint(env: Any) -> str:
-    if isinstance(env, AECEnv):
-        return ", not an AEC env: pettingzoo.utils.conversions.aec_to_parallel converts it"
-    if isinstance(env, gymnasium.Env):
-        return ", not a gymnasium env, which has one agent: SB3's make_vec_env takes it"
-    if isinstance(env, VecEnv):
-        return ", not a vector env"
-    if hasattr(env, "parallel_env"):
-        return ", not a module: call its parallel_env()"
-    return ", not what makes one: call it" if callable(env) else ""
-
-
-def without_black_death(env: ParallelEnv) -> ParallelEnv:
-    """The env without SuperSuit's ``black_death_v3``, whatever is around it; :class:`FlatEnv` does that wrapper's work.
-
-    The wrapper passes on no agent's end, and adds a step without agents to each episode.
-    """
-    if isinstance(env, black_death_par):
-        return without_black_death(env.env)
-    if not isinstance(env, BaseParallelWrapper):
-        return env
-    inner = without_black_death(env.env)
-    if inner is env.env:
-        return env
-    outer = copy.copy(env)
-    outer.env = inner
-    return outer

@@ -1,18 +1,16 @@
 """Agents that die or join, and infos of the last step, each with a test that fails on SuperSuit's own flattening."""
 
-import functools
-
-import gymnasium
 import numpy as np
 import pytest
-import supersuit
-from gymnasium import spaces
-from pettingzoo.utils import BaseParallelWrapper
+from gymnasium.utils.env_checker import data_equivalence
+from stable_baselines3 import PPO
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import VecMonitor
 
-from sb3_flock import flatten, flocking_v0, make_vec_env
-from sb3_flock.settings import RunError, SettingsError
+from sb3_flock import Scenario, flatten, make_vec_env
+from sb3_flock.settings import RunError
 from tests.envs.scripted import LIVES, Scripted
-from tests.helpers import assert_equal_rollouts
 
 N = len(LIVES)
 EPISODE = 6
@@ -83,25 +81,6 @@ def test_only_living_agents_get_actions_and_no_step_is_added_to_an_episode():
     assert (copy.steps, copy.received) == (0, [])
 
 
-class Halved(BaseParallelWrapper):
-    """A wrapper around another one."""
-
-    def reset(self, seed=None, options=None):
-        observations, infos = super().reset(seed, options)
-        return {name: numbers / 2 for name, numbers in observations.items()}, infos
-
-    def step(self, actions):
-        observations, *rest = super().step(actions)
-        return {name: numbers / 2 for name, numbers in observations.items()}, *rest
-
-
-def test_black_death_changes_nothing_wherever_it_is_in_the_chain():
-    assert_equal_rollouts(flatten(Scripted(), 2, seed=0), flatten(supersuit.black_death_v3(Scripted()), 2, seed=0), 15)
-    outer = Halved(supersuit.black_death_v3(Scripted()))
-    assert_equal_rollouts(flatten(Halved(Scripted()), seed=0), flatten(outer, seed=0), 15)
-    assert isinstance(outer.env, type(supersuit.black_death_v3(Scripted())))  # the given env stays as it is
-
-
 class Sloppy(Scripted):
     """Ends without flags, after two steps."""
 
@@ -147,41 +126,64 @@ def test_an_env_needs_no_render_mode_and_no_metadata(monkeypatch):
     assert env.reset().shape == (2 * N, 3)
 
 
-class Mixed(Scripted):
-    """Agents with spaces of their own."""
-
-    def __init__(self, kind):
-        super().__init__()
-        self.kind = kind
-
-    def observation_space(self, agent):
-        return spaces.Box(0, 1, (3 + (agent == "c" and self.kind == "observation"),))
-
-    def action_space(self, agent):
-        return spaces.Box(0, 1, (2 + (agent == "c" and self.kind == "action"),))
-
-
-NOT_PARALLEL = [
-    (flocking_v0.parallel_env, "not what makes one: call it"),
-    (functools.partial(flocking_v0.parallel_env, n_vehicles=2), "not what makes one: call it"),
-    (flocking_v0, r"not a module: call its parallel_env\(\)"),
-    (flocking_v0.raw_env(), "not an AEC env: pettingzoo.utils.conversions.aec_to_parallel converts it"),
-    (gymnasium.make("Pendulum-v1"), "not a gymnasium env, which has one agent: SB3's make_vec_env takes it"),
-    (make_vec_env(n_flocks=1), "not a vector env"),
-    (None, "needed$"),
-]
+@pytest.mark.parametrize("num_cpus", [0, 2])
+def test_the_monitor_counts_living_agents_alone(num_cpus):
+    env = flatten(Scripted(), n_copies=2, num_cpus=num_cpus, seed=0, monitor=True)
+    roll(env, 4)  # what a reset breaks off does not count
+    _, steps = roll(env)
+    assert env.env_is_wrapped(Monitor) == [True] * 2 * N
+    env.close()
+    lengths = np.tile([end - start for start, end, _ in LIVES.values()], 2)
+    episodes = {
+        (step, slot): info["episode"]
+        for step, (*_, infos) in enumerate(steps)
+        for slot, info in enumerate(infos)
+        if "episode" in info
+    }
+    ends = [end for _, end, _ in LIVES.values()] * 2
+    assert set(episodes) == {(first + end - 1, slot) for first in (0, EPISODE) for slot, end in enumerate(ends)}
+    for (_, slot), episode in episodes.items():
+        assert episode["l"] == lengths[slot]
+        assert episode["r"] == 10 * (slot % N + 1) * lengths[slot]
+        assert 0 <= episode["t"] < 60
 
 
-@pytest.mark.parametrize(("env", "hint"), NOT_PARALLEL, ids=[hint for _, hint in NOT_PARALLEL])
-def test_something_else_than_a_parallel_env_is_refused_in_one_line(env, hint):
-    with pytest.raises(SettingsError, match=f"^env = .*: a PettingZoo parallel env is .*{hint}") as error:
-        flatten(env)
-    assert "\n" not in str(error.value)
+def test_the_monitor_agrees_with_sb3s_where_all_live():
+    scenario = Scenario(max_cycles=5)
+    ours, sb3s = make_vec_env(scenario, 2, seed=0, monitor=True), VecMonitor(make_vec_env(scenario, 2, seed=0))
+    for (*_, infos), (*_, expected) in zip(roll(ours, 10)[1], roll(sb3s, 10)[1], strict=True):
+        for info, other in zip(infos, expected, strict=True):
+            assert ("episode" in info) == ("episode" in other)
+            if "episode" in info:
+                assert info["episode"]["r"] == pytest.approx(other["episode"]["r"], rel=1e-5)
+                assert info["episode"]["l"] == other["episode"]["l"] == 5
+    assert not any("episode" in info for info in roll(make_vec_env(scenario, 2, seed=0), 5)[1][-1][-1])
 
 
-def test_agents_that_differ_in_a_space_are_refused_in_one_line():
-    for kind, wrapper in (("observation", "pad_observations_v0"), ("action", "pad_action_space_v0")):
-        with pytest.raises(SettingsError, match=f"env: {kind}_space of a and of c differ.*{wrapper}"):
-            flatten(Mixed(kind))
-    with pytest.raises(SettingsError, match="env has no possible_agents"):
-        flatten(Scripted({}))
+def test_evaluate_policy_counts_the_monitors_episodes():
+    env = flatten(Scripted(), n_copies=2, seed=0, monitor=True)
+    model = PPO("MlpPolicy", env, n_steps=8, batch_size=8, device="cpu")
+    returns, lengths = evaluate_policy(model, env, n_eval_episodes=8, return_episode_rewards=True)
+    assert sorted(zip(returns, lengths, strict=True)) == sorted([(30, 3), (120, 6), (90, 3), (240, 6)] * 2)
+
+
+@pytest.mark.parametrize("steps", [2, 4])
+def test_an_episode_continues_from_its_state_where_agents_died_or_have_not_joined(steps):
+    env, other = (flatten(Scripted(), n_copies=2, seed=0, monitor=True) for _ in range(2))
+    roll(env, steps)
+    other.reset()
+    other.load_state_dict(env.state_dict())
+    for step in range(8):
+        ours, theirs = (one.step(np.full((2 * N, 2), step / 10, np.float32)) for one in (env, other))
+        for mine, yours in zip(ours[:3], theirs[:3], strict=True):
+            np.testing.assert_array_equal(mine, yours)
+        for infos in (ours[3], theirs[3]):
+            for info in infos:
+                info.get("episode", {}).pop("t", None)
+        assert data_equivalence(ours[3], theirs[3], exact=True)
+
+
+def test_an_env_that_cannot_save_its_state_is_named_in_one_line(monkeypatch):
+    monkeypatch.delattr(Scripted, "state_dict")
+    with pytest.raises(NotImplementedError, match="^Scripted has no state_dict and load_state_dict to save its episodes$"):
+        flatten(Scripted(), seed=0).state_dict()
