@@ -105,6 +105,48 @@ def test_a_full_buffer_holds_the_newest_transitions_and_their_next_observations(
     assert len(compact._last_observations) <= 21
 
 
+@pytest.mark.parametrize("steps", [12, 150])
+def test_steps_without_an_agent_are_not_sampled_and_the_others_evenly(steps):
+    buffer = CompactReplayBuffer(80, *SPACES, device="cpu", n_envs=N_ENVS)
+    observations = np.zeros((N_ENVS, *SPACES[0].shape), np.float32)
+    for step in range(steps):
+        alive = [True, step % 2 == 0, step % 4 == 0, False]
+        infos = [{"alive": acts} for acts in alive]
+        rewards = step * N_ENVS + np.arange(N_ENVS)
+        buffer.add(observations, observations, np.zeros((N_ENVS, 2)), rewards, np.zeros(N_ENVS, bool), infos)
+    first = max(0, steps - 20)
+    stored = [
+        step * N_ENVS + env for step in range(first, steps) for env, every in ((0, 1), (1, 2), (2, 4)) if step % every == 0
+    ]
+    np.random.seed(0)  # noqa: NPY002 - what SB3 draws from
+    seen = buffer.sample(20_000).rewards.numpy().ravel().astype(int)
+    other = buffer.sample_indices(20_000)
+    assert set(seen) == set(stored)
+    assert set(buffer.rewards[other].astype(int)) == set(stored)
+    counts = np.unique(seen, return_counts=True)[1] * len(stored) / 20_000
+    assert 0.8 < counts.min() <= counts.max() < 1.2
+    restored = CompactReplayBuffer(80, *SPACES, device="cpu", n_envs=N_ENVS)
+    load_replay_state(restored, replay_state(buffer))
+    th.testing.assert_close(samples(restored).rewards, samples(buffer).rewards, rtol=0, atol=0)
+
+
+def test_only_living_agents_need_an_expert_action():
+    buffer = CompactReplayBuffer(80, *SPACES, device="cpu", n_envs=2, store_expert_actions=True)
+    observations, infos = np.zeros((2, *SPACES[0].shape), np.float32), [{"expert_action": SPACES[1].high}, {"alive": False}]
+    buffer.add(observations, observations, np.zeros((2, 2)), np.zeros(2), np.zeros(2, bool), infos)
+    assert (buffer.sample(9).expert_actions == 1).all()
+
+
+def test_a_state_of_the_previous_release_has_living_agents_alone():
+    buffer, other = (CompactReplayBuffer(80, *SPACES, device="cpu", n_envs=N_ENVS) for _ in range(2))
+    fill(buffer, 7)
+    state = replay_state(buffer)
+    assert state["arrays"].pop("alive").all()
+    other.alive[:] = False
+    load_replay_state(other, state)
+    th.testing.assert_close(samples(other).rewards, samples(buffer).rewards)
+
+
 def test_observations_are_rounded_to_the_nearest_half_as_numpy_does():
     buffer = CompactReplayBuffer(8, *SPACES, n_envs=N_ENVS)
     rng = np.random.default_rng(0)
