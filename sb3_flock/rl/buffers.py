@@ -153,8 +153,9 @@ class CompactReplayBuffer(ReplayBuffer):
         self, batch_inds: NDArray[np.int64], env: VecNormalize | None = None
     ) -> ReplayBufferSamples | ExpertReplayBufferSamples:
         at = batch_inds, env_indices = self._draw_envs(batch_inds)
-        next_observations = self.observations[(batch_inds + 1) % self.buffer_size, env_indices]
-        observations, actions, dones = self.observations[at], self.actions[at], self.dones[at]
+        next_observations: Any = self.observations[(batch_inds + 1) % self.buffer_size, env_indices]
+        observations: Any = self.observations[at]
+        actions, dones = self.actions[at], self.dones[at]
         index, last = self.last_observations(*at)
         next_observations[index >= 0] = last.reshape(-1, *next_observations.shape[1:])
         if self.mirror_augmentation:
@@ -162,12 +163,16 @@ class CompactReplayBuffer(ReplayBuffer):
             for rows in (observations, next_observations):
                 rows[:half] = rows[:half, ..., ::-1].copy()
             actions[:half, 1] *= -1
+        rewards = self.rewards[at][:, None]
+        if env is not None:
+            observations, next_observations = env.normalize_obs(observations), env.normalize_obs(next_observations)
+            rewards = env.normalize_reward(rewards)
         samples = ReplayBufferSamples(
             self._to_float(observations),
             self.to_torch(actions, copy=False),
             self._to_float(next_observations),
             self.to_torch((dones * (1 - self.timeouts[at]))[:, None], copy=False),
-            self.to_torch(self.rewards[at][:, None], copy=False),
+            self.to_torch(rewards, copy=False),
         )
         if self.expert_actions is None:
             return samples
@@ -176,7 +181,7 @@ class CompactReplayBuffer(ReplayBuffer):
             expert_actions[:half, 1] *= -1
         return ExpertReplayBufferSamples(*samples, self.to_torch(expert_actions, copy=False))
 
-    def _to_float(self, observations: NDArray[np.float16]) -> th.Tensor:
+    def _to_float(self, observations: Any) -> th.Tensor:
         return self.to_torch(observations, copy=False).float()
 
 

@@ -12,6 +12,7 @@ from stable_baselines3.common.buffers import ReplayBuffer, RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_flock._compat import progress_remaining, set_noise_std
 from sb3_flock._renamed import renamed_member
@@ -33,11 +34,16 @@ class NeighborInclusiveReward(BaseCallback):
     the replay buffer stores the mixed ones. The raw reward stays in ``rollout/ep_rew_mean``, and the callback copies it to each
     info's ``reward`` key; the mixed one is logged as ``rollout/ep_mixed_rew_mean``. Both are means over the last 100 episodes.
 
+    With ``VecNormalize``, on policy (PPO, A2C) the rewards are mixed before they are normalized: the buffer stores the mixed
+    reward divided by the standard deviation of the raw rewards' discounted returns, and clipped, which is what ``VecNormalize``
+    computes. Off policy (DDPG, TD3, SAC) it is refused, also with ``norm_reward=False``: SB3 takes the rewards that the replay
+    buffer stores from ``VecNormalize``, below which no callback reaches.
+
     :param lambda_: share of a vehicle's own reward, in [0, 1]
     :param n_agents: agents in one copy of the env; needed only on vector envs that :func:`sb3_flock.flatten` did not make
     :param verbose: SB3's verbosity
-    :raises SettingsError: for a share outside [0, 1]; at the start of the training, if the agents cannot be counted or the
-        env is wrapped in ``VecNormalize``, which would replace the mixed rewards by its own
+    :raises SettingsError: for a share outside [0, 1]; at the start of the training, if the agents cannot be counted or an
+        off-policy algorithm's env is wrapped in ``VecNormalize``
     """
 
     def __init__(self, lambda_: float = 0.7, n_agents: int | None = None, verbose: int = 0) -> None:
@@ -47,13 +53,16 @@ class NeighborInclusiveReward(BaseCallback):
         self.lambda_ = lambda_
         self.n_agents = n_agents
         self._agents_per_copy = n_agents or 1
+        self._vec_normalize: VecNormalize | None = None
         self._returns = np.zeros(0)
         self._finished: deque[float] = deque(maxlen=100)
 
     def _init_callback(self) -> None:
-        if self.model.get_vec_normalize_env() is not None:
+        self._vec_normalize = self.model.get_vec_normalize_env()
+        if self._vec_normalize is not None and isinstance(self.model, OffPolicyAlgorithm):
             raise SettingsError(
-                "VecNormalize is not accepted: the replay buffer would store its rewards and not the neighbor-inclusive ones"
+                f"VecNormalize is not accepted with {type(self.model).__name__}: the replay buffer would store its rewards and "
+                "not the neighbor-inclusive ones"
             )
         n_envs = self.training_env.num_envs
         counted = getattr(self.training_env, "n_agents", None)
@@ -69,10 +78,12 @@ class NeighborInclusiveReward(BaseCallback):
     def _on_step(self) -> bool:
         rewards, infos = self.locals["rewards"], self.locals["infos"]
         dones = np.asarray(self.locals["dones"], dtype=bool)  # SuperSuit's own wrapper gives integers
-        for info, reward in zip(infos, rewards.tolist(), strict=True):
+        raw = rewards if self._vec_normalize is None else self._vec_normalize.get_original_reward()
+        for info, reward in zip(infos, raw.tolist(), strict=True):
             info["reward"] = reward
-        rewards[:] = self.mix(rewards, infos)
-        self._returns += rewards
+        mixed = self.mix(raw, infos).astype(np.float32)
+        rewards[:] = mixed if self._vec_normalize is None else self._vec_normalize.normalize_reward(mixed)
+        self._returns += mixed
         if dones.any():
             self._finished.extend(self._returns[dones].tolist())
             self._returns[dones] = 0.0

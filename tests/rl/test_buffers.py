@@ -3,8 +3,9 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_flock import CompactReplayBuffer, Scenario
+from sb3_flock import CompactReplayBuffer, Scenario, make_vec_env
 from sb3_flock._renamed import RenamedWarning
 from sb3_flock.envs.flocking_v0 import action_space, observation_space
 from sb3_flock.rl.buffers import load_replay_state, replay_state
@@ -31,9 +32,9 @@ def fill(buffer, steps, seed=0):
         observations = first
 
 
-def samples(buffer, seed=0):
+def samples(buffer, seed=0, env=None):
     np.random.seed(seed)  # noqa: NPY002 - what SB3 draws from
-    return buffer.sample(200)
+    return buffer.sample(200, env)
 
 
 @pytest.mark.parametrize("steps", [1, 30])
@@ -47,6 +48,23 @@ def test_samples_equal_those_of_sb3s_buffer_up_to_rounding(steps):
     for name in ("observations", "next_observations"):
         th.testing.assert_close(getattr(ours, name), getattr(theirs, name), rtol=5e-4, atol=0)
         assert getattr(ours, name).dtype == th.float32
+
+
+@pytest.mark.parametrize("options", [{}, {"norm_obs": False}, {"norm_reward": False}], ids=str)
+def test_samples_are_normalized_as_sb3s_are(options):
+    normalize = VecNormalize(make_vec_env(n_flocks=2, seed=0), **options)
+    normalize.reset()
+    for _ in range(30):
+        normalize.step(np.stack([normalize.action_space.sample() for _ in range(6)]))
+    compact, sb3 = (kind(400, *SPACES, device="cpu", n_envs=N_ENVS) for kind in (CompactReplayBuffer, ReplayBuffer))
+    fill(compact, 30)
+    fill(sb3, 30)
+    ours, theirs = samples(compact, env=normalize), samples(sb3, env=normalize)
+    for name in ("observations", "next_observations", "rewards"):
+        th.testing.assert_close(getattr(ours, name), getattr(theirs, name), rtol=1e-3, atol=2e-2)
+        assert getattr(ours, name).dtype == th.float32
+    is_normalized = th.equal(theirs.observations, samples(sb3).observations)
+    assert is_normalized == (options == {"norm_obs": False})
 
 
 def test_mirror_augmentation_mirrors_half_of_a_sample_left_for_right():

@@ -180,10 +180,34 @@ def test_the_mixed_return_is_logged_under_its_own_name(tmp_path):
     assert any(row["flock/connectivity"] for row in logged)
 
 
-def test_vec_normalize_is_refused():
+def test_vec_normalize_is_refused_off_policy():
     env = VecNormalize(make_vec_env(CROWDED, n_flocks=1, seed=1), norm_reward=False)
-    with pytest.raises(SettingsError, match="VecNormalize is not accepted"):
+    with pytest.raises(SettingsError, match="VecNormalize is not accepted with DDPG"):
         learn(env, NeighborInclusiveReward(), 1, FlockCNN)
+
+
+class MixThenNormalize(Record):
+    """The normalized mix by the formula, with the statistics of each step."""
+
+    def _on_step(self):
+        super()._on_step()
+        raw = [sum(info["reward_terms"].values()) for info in self.locals["infos"]]
+        np.testing.assert_allclose([info["reward"] for info in self.locals["infos"]], raw, rtol=1e-5)
+        mixed = np.array(expected_mix(self.locals["infos"], 4, 0.7))
+        self.steps[-1] += (mixed, self.training_env.normalize_reward(mixed))
+        return True
+
+
+@pytest.mark.parametrize("options", [{}, {"norm_reward": False}, {"clip_reward": 0.5}], ids=str)
+def test_on_policy_rewards_are_mixed_and_then_normalized(options):
+    env = VecMonitor(VecNormalize(make_vec_env(CROWDED.replace(max_cycles=40), n_flocks=2, seed=1), **options))
+    model = PPO("MlpPolicy", env, policy_kwargs={"net_arch": [8]}, n_steps=8, batch_size=64, device="cpu", seed=0)
+    record, callback = MixThenNormalize(), NeighborInclusiveReward(0.7)
+    model.learn(8 * env.num_envs, callback=[callback, record])
+    np.testing.assert_allclose(model.rollout_buffer.rewards, [step[-1] for step in record.steps], rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(callback._returns, np.sum([step[-2] for step in record.steps], 0), rtol=1e-4)
+    changes = [np.abs(mixed - [info["reward"] for info in infos]) > 1e-6 for _, infos, _, mixed, _ in record.steps]
+    assert np.sum(changes) > 10
 
 
 def test_a_wrong_or_missing_number_of_agents_is_refused():
