@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from sb3_flock.envs.vec_env import flatten, make_vec_env
     from sb3_flock.evaluation import evaluate, register_metric
     from sb3_flock.rl.buffers import CompactReplayBuffer
-    from sb3_flock.rl.callbacks import NeighborInclusiveReward
+    from sb3_flock.rl.callbacks import DropDeadTransitions, NeighborInclusiveReward
     from sb3_flock.rl.ddpg import FlockDDPG, FlockTD3
     from sb3_flock.rl.policies import FlockPolicy, FlockSACPolicy
     from sb3_flock.rl.registry import register_algorithm
@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 __all__ = [
     "CompactReplayBuffer",
     "Controller",
+    "DropDeadTransitions",
     "ExpertEnv",
     "FlockCNN",
     "FlockDDPG",
@@ -70,6 +71,7 @@ __all__ = [
 _HOMES = {
     "CompactReplayBuffer": "rl.buffers",
     "Controller": "controllers",
+    "DropDeadTransitions": "rl.callbacks",
     "ExpertEnv": "envs.expert_env",
     "FlockCNN": "rl.torch_layers",
     "FlockDDPG": "rl.ddpg",

@@ -18,7 +18,8 @@ only, a vehicle's action does not depend on how many others are computed with it
 class PolicyController(Controller):
     """Drives by anything with SB3's ``predict(observations, deterministic=...)``: a model, its policy or a loaded policy.
 
-    :param policy: the policy; one row of its input is one vehicle's observation
+    :param policy: the policy; one row of its input is one vehicle's observation. For a model whose env is wrapped in
+        ``VecNormalize`` the observations are normalized by it
     """
 
     def __init__(self, policy: Any) -> None:
@@ -29,7 +30,8 @@ class PolicyController(Controller):
         observations = observe(sensing, scenario)
         rows = observations.reshape(-1, *scenario.observation_shape)
         padded = np.zeros((-(-len(rows) // _BLOCK) * _BLOCK, *rows.shape[1:]), dtype=rows.dtype)
-        padded[: len(rows)] = rows
+        vec_normalize = getattr(self.policy, "get_vec_normalize_env", lambda: None)()
+        padded[: len(rows)] = rows if vec_normalize is None else vec_normalize.normalize_obs(rows)
         actions = [
             self.policy.predict(padded[start : start + _BLOCK], deterministic=True)[0]
             for start in range(0, len(padded), _BLOCK)

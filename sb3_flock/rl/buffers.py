@@ -35,15 +35,18 @@ class CompactReplayBuffer(ReplayBuffer):
     channels of 11 x 11; with motion channels both take twice as much).
 
     A transition's next observation is the one stored after it; the last one of an episode is stored separately. Rounding
-    changes the anchors' values by at most 0.05 %. Unlike SB3's ``optimize_memory_usage`` it handles time limits.
+    changes the anchors' values by at most 0.05 %. Unlike SB3's ``optimize_memory_usage`` it handles time limits. Steps in which
+    no agent acted (``info["alive"]`` is false) are not sampled.
 
     :param buffer_size: capacity [transitions]
     :param observation_space: a ``Box`` of floats
     :param mirror_augmentation: mirror half of every sample, left for right: the task is symmetric, so a mirrored transition
-        is as valid as the original
+        is as valid as the original. The last axis of the observations ``(channels, l, l)`` is reversed, and the second action,
+        the turn rate, changes its sign
     :param store_expert_actions: also store each info's ``expert_action`` ``(2,)`` [m/s, rad/s], see
         :class:`~sb3_flock.envs.expert_env.ExpertEnv`; samples are then :class:`ExpertReplayBufferSamples`
-    :raises SettingsError: if an added transition has no ``expert_action`` although they are to be stored
+    :raises SettingsError: for ``mirror_augmentation`` with other observations or actions; if an added transition has no
+        ``expert_action`` although they are to be stored
 
     The other parameters are those of SB3's ``ReplayBuffer``.
     """
@@ -72,6 +75,8 @@ class CompactReplayBuffer(ReplayBuffer):
             store_expert_actions = options.pop("store_expert_actions", store_expert_actions)
             if options:
                 raise TypeError(f"CompactReplayBuffer got an unexpected argument {next(iter(options))!r}")
+        if mirror_augmentation:
+            _check_mirror(observation_space, action_space)
         half = spaces.Box(-1.0, 1.0, observation_space.shape, np.float16)  # only its shape and type count
         # One row more than asked for: the row after the newest holds its next observation, and is not sampled.
         super().__init__(
@@ -87,6 +92,7 @@ class CompactReplayBuffer(ReplayBuffer):
         self.handle_timeout_termination = handle_timeout_termination
         self.mirror_augmentation = mirror_augmentation
         self.expert_actions = np.zeros_like(self.actions) if store_expert_actions else None
+        self.alive = np.ones((self.buffer_size, n_envs), bool)
         self._last_observations: dict[int, dict[int, NDArray[np.float16]]] = {}
 
     def add(
@@ -103,25 +109,35 @@ class CompactReplayBuffer(ReplayBuffer):
         self._last_observations.pop(self.pos, None)
         if done.any():
             self._last_observations[self.pos] = {env: next_obs[env].copy() for env in np.flatnonzero(done).tolist()}
+        self.alive[self.pos] = alive = [info.get("alive", True) for info in infos]
         if self.expert_actions is not None:
-            if not all("expert_action" in info for info in infos):
+            if not all("expert_action" in info for info, acts in zip(infos, alive, strict=True) if acts):
                 raise SettingsError(
                     "store_expert_actions = True: the infos have no expert_action; an ExpertEnv with queries=True gives it, "
                     "and a model without bc_coef does not need it"
                 )
             low, high = self.action_space.low, self.action_space.high  # type: ignore[attr-defined]
             self.expert_actions[self.pos] = (
-                2 * (np.array([info["expert_action"] for info in infos]) - low) / (high - low) - 1
+                2 * (np.array([info.get("expert_action", low) for info in infos]) - low) / (high - low) - 1
             )
         super().add(obs, next_obs, action, reward, done, infos)
 
     def sample_indices(self, batch_size: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Draw a minibatch: row and env of each transition, each ``(batch,)``, from NumPy's global stream as SB3 does."""
+        return self._draw_envs(self._draw_rows(batch_size))
+
+    def _draw_rows(self, count: int) -> NDArray[np.int64]:
         if self.full:  # the row at pos holds the newest transition's next observation alone
-            rows = (np.random.randint(1, self.buffer_size, size=batch_size) + self.pos) % self.buffer_size  # noqa: NPY002
-        else:
-            rows = np.random.randint(0, self.pos, size=batch_size)  # noqa: NPY002
-        return rows, np.random.randint(0, high=self.n_envs, size=(batch_size,))  # noqa: NPY002
+            return (np.random.randint(1, self.buffer_size, size=count) + self.pos) % self.buffer_size  # noqa: NPY002
+        return np.random.randint(0, self.pos, size=count)  # noqa: NPY002
+
+    def _draw_envs(self, rows: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """An env for each row; both are drawn again where no agent acted."""
+        rows, envs = rows.copy(), np.random.randint(0, high=self.n_envs, size=len(rows))  # noqa: NPY002
+        while len(dead := np.flatnonzero(~self.alive[rows, envs])):
+            rows[dead] = self._draw_rows(len(dead))
+            envs[dead] = np.random.randint(0, high=self.n_envs, size=len(dead))  # noqa: NPY002
+        return rows, envs
 
     def last_observations(
         self, rows: NDArray[np.int64], envs: NDArray[np.int64]
@@ -140,10 +156,10 @@ class CompactReplayBuffer(ReplayBuffer):
     def _get_samples(  # type: ignore[override]
         self, batch_inds: NDArray[np.int64], env: VecNormalize | None = None
     ) -> ReplayBufferSamples | ExpertReplayBufferSamples:
-        env_indices = np.random.randint(0, high=self.n_envs, size=(len(batch_inds),))  # noqa: NPY002 - as SB3 draws them
-        at = (batch_inds, env_indices)
-        next_observations = self.observations[(batch_inds + 1) % self.buffer_size, env_indices]
-        observations, actions, dones = self.observations[at], self.actions[at], self.dones[at]
+        at = batch_inds, env_indices = self._draw_envs(batch_inds)
+        next_observations: Any = self.observations[(batch_inds + 1) % self.buffer_size, env_indices]
+        observations: Any = self.observations[at]
+        actions, dones = self.actions[at], self.dones[at]
         index, last = self.last_observations(*at)
         next_observations[index >= 0] = last.reshape(-1, *next_observations.shape[1:])
         if self.mirror_augmentation:
@@ -151,12 +167,16 @@ class CompactReplayBuffer(ReplayBuffer):
             for rows in (observations, next_observations):
                 rows[:half] = rows[:half, ..., ::-1].copy()
             actions[:half, 1] *= -1
+        rewards = self.rewards[at][:, None]
+        if env is not None:
+            observations, next_observations = env.normalize_obs(observations), env.normalize_obs(next_observations)
+            rewards = env.normalize_reward(rewards)
         samples = ReplayBufferSamples(
             self._to_float(observations),
             self.to_torch(actions, copy=False),
             self._to_float(next_observations),
             self.to_torch((dones * (1 - self.timeouts[at]))[:, None], copy=False),
-            self.to_torch(self.rewards[at][:, None], copy=False),
+            self.to_torch(rewards, copy=False),
         )
         if self.expert_actions is None:
             return samples
@@ -165,8 +185,21 @@ class CompactReplayBuffer(ReplayBuffer):
             expert_actions[:half, 1] *= -1
         return ExpertReplayBufferSamples(*samples, self.to_torch(expert_actions, copy=False))
 
-    def _to_float(self, observations: NDArray[np.float16]) -> th.Tensor:
+    def _to_float(self, observations: Any) -> th.Tensor:
         return self.to_torch(observations, copy=False).float()
+
+
+def _check_mirror(observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
+    shape = observation_space.shape or ()
+    is_map = len(shape) == 3 and shape[1] == shape[2]
+    turns = (
+        isinstance(action_space, spaces.Box) and action_space.shape == (2,) and action_space.low[1] == -action_space.high[1]
+    )
+    if not (is_map and turns):
+        raise SettingsError(
+            f"mirror_augmentation = True: observations of shape (channels, l, l), and actions of a speed and a turn rate within "
+            f"[-w, w] are needed, not {observation_space} and {action_space}"
+        )
 
 
 def replay_state(buffer: ReplayBuffer) -> dict[str, Any]:
@@ -187,6 +220,9 @@ def load_replay_state(buffer: ReplayBuffer, state: Mapping[str, Any]) -> None:
     :raises ValueError: if the rows do not fit
     """
     for name, rows in _rows(buffer).items():
+        if name == "alive" and name not in state["arrays"]:  # a checkpoint of the previous release
+            rows[:] = True
+            continue
         saved = state["arrays"][name]
         if saved.dtype != rows.dtype or saved.shape[1:] != rows.shape[1:]:
             raise ValueError(

@@ -8,11 +8,16 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from stable_baselines3.common.buffers import ReplayBuffer, RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_flock._compat import progress_remaining, set_noise_std
 from sb3_flock._renamed import renamed_member
+from sb3_flock.rl.alive_buffers import AliveReplayBuffer, AliveRolloutBuffer
+from sb3_flock.rl.buffers import CompactReplayBuffer
 from sb3_flock.settings import RunError, SettingsError
 from sb3_flock.sim import mix_rewards
 
@@ -22,17 +27,23 @@ class NeighborInclusiveReward(BaseCallback):
 
     It works on any PettingZoo env flattened by SuperSuit into a parameter-shared vector env whose infos follow this
     contract: ``info["neighbors"]`` holds the indices into ``possible_agents`` of the agent's own copy of the env. An info
-    without that key means no neighbors, and the agent keeps its own reward.
+    without that key means no neighbors, and the agent keeps its own reward. A neighbor that did not act (``info["alive"]`` is
+    false) has no reward, and does not count.
 
     SB3 calls it after the env's step and before the transition is stored. The callback rewrites the rewards in place, so that
     the replay buffer stores the mixed ones. The raw reward stays in ``rollout/ep_rew_mean``, and the callback copies it to each
     info's ``reward`` key; the mixed one is logged as ``rollout/ep_mixed_rew_mean``. Both are means over the last 100 episodes.
 
+    With ``VecNormalize``, on policy (PPO, A2C) the rewards are mixed before they are normalized: the buffer stores the mixed
+    reward divided by the standard deviation of the raw rewards' discounted returns, and clipped, which is what ``VecNormalize``
+    computes. Off policy (DDPG, TD3, SAC) it is refused, also with ``norm_reward=False``: SB3 takes the rewards that the replay
+    buffer stores from ``VecNormalize``, below which no callback reaches.
+
     :param lambda_: share of a vehicle's own reward, in [0, 1]
     :param n_agents: agents in one copy of the env; needed only on vector envs that :func:`sb3_flock.flatten` did not make
     :param verbose: SB3's verbosity
-    :raises SettingsError: for a share outside [0, 1]; at the start of the training, if the agents cannot be counted or the
-        env is wrapped in ``VecNormalize``, which would replace the mixed rewards by its own
+    :raises SettingsError: for a share outside [0, 1]; at the start of the training, if the agents cannot be counted or an
+        off-policy algorithm's env is wrapped in ``VecNormalize``
     """
 
     def __init__(self, lambda_: float = 0.7, n_agents: int | None = None, verbose: int = 0) -> None:
@@ -42,13 +53,16 @@ class NeighborInclusiveReward(BaseCallback):
         self.lambda_ = lambda_
         self.n_agents = n_agents
         self._agents_per_copy = n_agents or 1
+        self._vec_normalize: VecNormalize | None = None
         self._returns = np.zeros(0)
         self._finished: deque[float] = deque(maxlen=100)
 
     def _init_callback(self) -> None:
-        if self.model.get_vec_normalize_env() is not None:
+        self._vec_normalize = self.model.get_vec_normalize_env()
+        if self._vec_normalize is not None and isinstance(self.model, OffPolicyAlgorithm):
             raise SettingsError(
-                "VecNormalize is not accepted: the replay buffer would store its rewards and not the neighbor-inclusive ones"
+                f"VecNormalize is not accepted with {type(self.model).__name__}: the replay buffer would store its rewards and "
+                "not the neighbor-inclusive ones"
             )
         n_envs = self.training_env.num_envs
         counted = getattr(self.training_env, "n_agents", None)
@@ -64,10 +78,12 @@ class NeighborInclusiveReward(BaseCallback):
     def _on_step(self) -> bool:
         rewards, infos = self.locals["rewards"], self.locals["infos"]
         dones = np.asarray(self.locals["dones"], dtype=bool)  # SuperSuit's own wrapper gives integers
-        for info, reward in zip(infos, rewards.tolist(), strict=True):
+        raw = rewards if self._vec_normalize is None else self._vec_normalize.get_original_reward()
+        for info, reward in zip(infos, raw.tolist(), strict=True):
             info["reward"] = reward
-        rewards[:] = self.mix(rewards, infos)
-        self._returns += rewards
+        mixed = self.mix(raw, infos).astype(np.float32)
+        rewards[:] = mixed if self._vec_normalize is None else self._vec_normalize.normalize_reward(mixed)
+        self._returns += mixed
         if dones.any():
             self._finished.extend(self._returns[dones].tolist())
             self._returns[dones] = 0.0
@@ -88,7 +104,9 @@ class NeighborInclusiveReward(BaseCallback):
         neighbors = [info.get("neighbors", ()) for info in infos]
         observers = np.repeat(np.arange(len(infos)), [len(found) for found in neighbors])
         first = observers - observers % self._agents_per_copy  # slot of the copy's first agent
-        return mix_rewards(rewards, observers, first + np.concatenate(neighbors).astype(np.int64), self.lambda_)
+        found = first + np.concatenate(neighbors).astype(np.int64)
+        acted = _alive(infos)[found]
+        return mix_rewards(rewards, observers[acted], found[acted], self.lambda_)
 
 
 class StoreExecutedActions(BaseCallback):
@@ -105,10 +123,51 @@ class StoreExecutedActions(BaseCallback):
         return True
 
 
+class DropDeadTransitions(BaseCallback):
+    """Lets a model learn from living agents alone, in an env whose agents die or join (:func:`sb3_flock.flatten`).
+
+    A step is left out where the slot's ``info["alive"]`` is false. A model with SB3's own buffer gets an
+    :class:`~sb3_flock.rl.alive_buffers.AliveReplayBuffer` or an :class:`~sb3_flock.rl.alive_buffers.AliveRolloutBuffer` in its
+    place; a :class:`~sb3_flock.rl.buffers.CompactReplayBuffer` needs no callback. ``num_timesteps`` counts all slots.
+
+    :raises SettingsError: at the start of the training, for a model with another buffer, or whose buffer has been filled without
+        this callback
+    """
+
+    def _init_callback(self) -> None:
+        model: Any = self.model
+        buffer = model.replay_buffer if isinstance(model, OffPolicyAlgorithm) else model.rollout_buffer
+        spaces = model.observation_space, model.action_space, model.device
+        if type(buffer) is ReplayBuffer and not buffer.optimize_memory_usage and buffer.size() == 0:
+            model.replay_buffer = AliveReplayBuffer(
+                buffer.buffer_size * buffer.n_envs, *spaces, handle_timeout_termination=buffer.handle_timeout_termination
+            )
+        elif type(buffer) is RolloutBuffer:
+            model.rollout_buffer = AliveRolloutBuffer(
+                buffer.buffer_size, *spaces, buffer.gae_lambda, buffer.gamma, buffer.n_envs
+            )
+        elif not isinstance(buffer, AliveReplayBuffer | AliveRolloutBuffer | CompactReplayBuffer):
+            raise SettingsError(
+                f"DropDeadTransitions: the model has a {type(buffer).__name__}; SB3's own ReplayBuffer, empty and without "
+                "optimize_memory_usage, its RolloutBuffer, or a CompactReplayBuffer is needed"
+            )
+
+    def _on_step(self) -> bool:
+        buffer = self.locals.get("rollout_buffer")
+        if isinstance(buffer, AliveRolloutBuffer):
+            buffer.alive[buffer.pos] = _alive(self.locals["infos"])
+        return True
+
+
+def _alive(infos: list[dict[str, Any]]) -> np.ndarray:
+    """Whether an agent acted in each slot, ``(slots,)``."""
+    return np.array([info.get("alive", True) for info in infos])
+
+
 class FlockMetrics(BaseCallback):
     """Logs the infos' ``metrics`` and ``reward_terms`` as ``flock/...``: means over the steps since an episode last ended.
 
-    Steps that an expert drove are left out.
+    Steps that an expert drove, or in which no agent acted, are left out.
     """
 
     def __init__(self, verbose: int = 0) -> None:
@@ -118,7 +177,7 @@ class FlockMetrics(BaseCallback):
 
     def _on_step(self) -> bool:
         for info in self.locals["infos"]:
-            if info.get("expert_drives"):
+            if info.get("expert_drives") or not info.get("alive", True):
                 continue
             for values in (info.get("metrics", {}), info.get("reward_terms", {})):
                 for name, value in values.items():

@@ -133,7 +133,10 @@ class CompiledUpdate:
 
 
 def can_compile(model: TD3) -> bool:
-    """Whether a model's update can be compiled: its parts are exactly ours, on the CPU, and the ``fast`` extra is installed."""
+    """Whether a model's update can be compiled: its parts are exactly ours, on the CPU, and the ``fast`` extra is installed.
+
+    With ``VecNormalize`` torch updates: the compiled update reads the observations as the buffer holds them.
+    """
     policy, networks = model.policy, (model.actor, model.critic)
     return (
         type(policy) is FlockPolicy
@@ -143,6 +146,7 @@ def can_compile(model: TD3) -> bool:
         and not policy.share_features_extractor
         and policy.activation_fn is nn.ReLU
         and model.device.type == "cpu"
+        and model.get_vec_normalize_env() is None
         and all(parameter.requires_grad for network in networks for parameter in network.parameters())
         and all(_is_plain_adam(network) for network in networks)
         and compiled_kernels() is not None

@@ -116,7 +116,7 @@ class FlockDDPG(FlockTD3, DDPG):
         actor_losses, critic_losses, bc_losses = [], [], []
         for _ in range(gradient_steps):
             self._n_updates += 1
-            batch = self.replay_buffer.sample(batch_size)  # type: ignore[union-attr]
+            batch = self.replay_buffer.sample(batch_size, env=self.get_vec_normalize_env())  # type: ignore[union-attr]
             discounts = self.gamma if batch.discounts is None else batch.discounts
             observations = extractor.patches(batch.observations)
             with th.no_grad():

@@ -21,6 +21,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from sb3_flock._compat import EPISODE_STATE, optimizers_of
 from sb3_flock.config.training import TrainingConfig
 from sb3_flock.serialization.migrate import FORMAT, MEMBER
+from sb3_flock.settings import SettingsError
 
 PACKAGES = ("sb3_flock", "stable_baselines3", "torch", "gymnasium", "pettingzoo", "supersuit", "numpy")
 
@@ -44,9 +45,16 @@ def save_model(
         is less than half as large
     :param extra: writes further members
     :return: the path
+    :raises SettingsError: for a model with observations normalized by ``VecNormalize``, whose statistics the file would not hold
     :raises OSError: if it cannot be written; an earlier file of that name stays
     """
     path = Path(path)
+    vec_normalize = model.get_vec_normalize_env()
+    if vec_normalize is not None and vec_normalize.norm_obs:
+        raise SettingsError(
+            "save_model: VecNormalize normalizes the model's observations, and the file would not hold its statistics; "
+            "norm_obs=False is needed, or SB3's own model.save and VecNormalize.save"
+        )
     member = {
         "format": FORMAT,
         "config": config.model_dump(mode="json"),

@@ -1,7 +1,9 @@
 import numpy as np
 import pytest
+from stable_baselines3 import DDPG
+from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_flock import FlockPolicy, Scenario
+from sb3_flock import FlockPolicy, Scenario, make_vec_env
 from sb3_flock.controllers.policy import PolicyController
 from sb3_flock.envs.flocking_v0 import action_space, observation_space
 from sb3_flock.sim import World, episode_rng, observe
@@ -51,3 +53,13 @@ def test_predict_is_called_with_blocks_of_one_shape_deterministically(n_flocks, 
     actions = PolicyController(policy).act(sensing, SCENARIO)
     assert policy.calls == [((256, 3, 11, 11), True)] * calls
     np.testing.assert_array_equal(actions, observe(sensing, SCENARIO)[..., [0, 2], 5, 5])
+
+
+def test_a_model_with_vec_normalize_sees_normalized_observations():
+    env = VecNormalize(make_vec_env(SCENARIO, 2, seed=0))
+    model = DDPG(FlockPolicy, env, buffer_size=20, device="cpu", policy_kwargs={"final_init": 1.0}, seed=0)
+    observations = model.env.reset()  # its own observations, and the statistics of them
+    for copy, start in zip(env.get_attr("unwrapped", indices=[0, 5]), (0, 5), strict=True):
+        actions = PolicyController(model).act(copy.world.sense(), SCENARIO)
+        expected, _ = model.predict(observations[start : start + 5], deterministic=True)
+        np.testing.assert_allclose(actions[0], expected, rtol=1e-4, atol=1e-6)

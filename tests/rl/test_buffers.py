@@ -3,8 +3,9 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_flock import CompactReplayBuffer, Scenario
+from sb3_flock import CompactReplayBuffer, Scenario, make_vec_env
 from sb3_flock._renamed import RenamedWarning
 from sb3_flock.envs.flocking_v0 import action_space, observation_space
 from sb3_flock.rl.buffers import load_replay_state, replay_state
@@ -31,9 +32,9 @@ def fill(buffer, steps, seed=0):
         observations = first
 
 
-def samples(buffer, seed=0):
+def samples(buffer, seed=0, env=None):
     np.random.seed(seed)  # noqa: NPY002 - what SB3 draws from
-    return buffer.sample(200)
+    return buffer.sample(200, env)
 
 
 @pytest.mark.parametrize("steps", [1, 30])
@@ -47,6 +48,23 @@ def test_samples_equal_those_of_sb3s_buffer_up_to_rounding(steps):
     for name in ("observations", "next_observations"):
         th.testing.assert_close(getattr(ours, name), getattr(theirs, name), rtol=5e-4, atol=0)
         assert getattr(ours, name).dtype == th.float32
+
+
+@pytest.mark.parametrize("options", [{}, {"norm_obs": False}, {"norm_reward": False}], ids=str)
+def test_samples_are_normalized_as_sb3s_are(options):
+    normalize = VecNormalize(make_vec_env(n_flocks=2, seed=0), **options)
+    normalize.reset()
+    for _ in range(30):
+        normalize.step(np.stack([normalize.action_space.sample() for _ in range(6)]))
+    compact, sb3 = (kind(400, *SPACES, device="cpu", n_envs=N_ENVS) for kind in (CompactReplayBuffer, ReplayBuffer))
+    fill(compact, 30)
+    fill(sb3, 30)
+    ours, theirs = samples(compact, env=normalize), samples(sb3, env=normalize)
+    for name in ("observations", "next_observations", "rewards"):
+        th.testing.assert_close(getattr(ours, name), getattr(theirs, name), rtol=1e-3, atol=2e-2)
+        assert getattr(ours, name).dtype == th.float32
+    is_normalized = th.equal(theirs.observations, samples(sb3).observations)
+    assert is_normalized == (options == {"norm_obs": False})
 
 
 def test_mirror_augmentation_mirrors_half_of_a_sample_left_for_right():
@@ -64,6 +82,25 @@ def test_mirror_augmentation_mirrors_half_of_a_sample_left_for_right():
     turned = th.cat([th.tensor([1.0, -1.0]).expand(100, 2), th.ones(100, 2)])
     th.testing.assert_close(batch.actions, expected.actions * turned, rtol=0, atol=0)
     th.testing.assert_close(batch.rewards, expected.rewards, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("observations", "actions"),
+    [
+        (spaces.Box(0, 1, (8,)), SPACES[1]),
+        (spaces.Box(0, 1, (3, 11, 44)), SPACES[1]),
+        (SPACES[0], spaces.Box(-1, 1, (3,))),
+        (SPACES[0], spaces.Box(0, 1, (2,))),
+        (SPACES[0], spaces.Discrete(3)),
+    ],
+)
+def test_what_has_no_left_and_right_is_not_mirrored(observations, actions):
+    with pytest.raises(
+        SettingsError, match=r"^mirror_augmentation = True: observations of shape \(channels, l, l\)"
+    ) as error:
+        CompactReplayBuffer(80, observations, actions, device="cpu", mirror_augmentation=True)
+    assert "\n" not in str(error.value)
+    CompactReplayBuffer(80, observations, actions, device="cpu")
 
 
 @pytest.mark.parametrize("mirror_augmentation", [False, True])
@@ -103,6 +140,48 @@ def test_a_full_buffer_holds_the_newest_transitions_and_their_next_observations(
             assert done.item() == large.dones[step, env] * (1 - large.timeouts[step, env])
     assert seen == set(range(53, 73))
     assert len(compact._last_observations) <= 21
+
+
+@pytest.mark.parametrize("steps", [12, 150])
+def test_steps_without_an_agent_are_not_sampled_and_the_others_evenly(steps):
+    buffer = CompactReplayBuffer(80, *SPACES, device="cpu", n_envs=N_ENVS)
+    observations = np.zeros((N_ENVS, *SPACES[0].shape), np.float32)
+    for step in range(steps):
+        alive = [True, step % 2 == 0, step % 4 == 0, False]
+        infos = [{"alive": acts} for acts in alive]
+        rewards = step * N_ENVS + np.arange(N_ENVS)
+        buffer.add(observations, observations, np.zeros((N_ENVS, 2)), rewards, np.zeros(N_ENVS, bool), infos)
+    first = max(0, steps - 20)
+    stored = [
+        step * N_ENVS + env for step in range(first, steps) for env, every in ((0, 1), (1, 2), (2, 4)) if step % every == 0
+    ]
+    np.random.seed(0)  # noqa: NPY002 - what SB3 draws from
+    seen = buffer.sample(20_000).rewards.numpy().ravel().astype(int)
+    other = buffer.sample_indices(20_000)
+    assert set(seen) == set(stored)
+    assert set(buffer.rewards[other].astype(int)) == set(stored)
+    counts = np.unique(seen, return_counts=True)[1] * len(stored) / 20_000
+    assert 0.8 < counts.min() <= counts.max() < 1.2
+    restored = CompactReplayBuffer(80, *SPACES, device="cpu", n_envs=N_ENVS)
+    load_replay_state(restored, replay_state(buffer))
+    th.testing.assert_close(samples(restored).rewards, samples(buffer).rewards, rtol=0, atol=0)
+
+
+def test_only_living_agents_need_an_expert_action():
+    buffer = CompactReplayBuffer(80, *SPACES, device="cpu", n_envs=2, store_expert_actions=True)
+    observations, infos = np.zeros((2, *SPACES[0].shape), np.float32), [{"expert_action": SPACES[1].high}, {"alive": False}]
+    buffer.add(observations, observations, np.zeros((2, 2)), np.zeros(2), np.zeros(2, bool), infos)
+    assert (buffer.sample(9).expert_actions == 1).all()
+
+
+def test_a_state_of_the_previous_release_has_living_agents_alone():
+    buffer, other = (CompactReplayBuffer(80, *SPACES, device="cpu", n_envs=N_ENVS) for _ in range(2))
+    fill(buffer, 7)
+    state = replay_state(buffer)
+    assert state["arrays"].pop("alive").all()
+    other.alive[:] = False
+    load_replay_state(other, state)
+    th.testing.assert_close(samples(other).rewards, samples(buffer).rewards)
 
 
 def test_observations_are_rounded_to_the_nearest_half_as_numpy_does():

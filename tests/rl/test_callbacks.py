@@ -3,21 +3,24 @@ import numpy as np
 import pytest
 import supersuit
 from mpe2 import simple_spread_v3
-from stable_baselines3 import DDPG
+from stable_baselines3 import A2C, DDPG, PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
-from sb3_flock import FlockCNN, NeighborInclusiveReward, Scenario, flatten, make_vec_env
+from sb3_flock import CompactReplayBuffer, FlockCNN, NeighborInclusiveReward, Scenario, flatten, make_vec_env
+from sb3_flock.rl.alive_buffers import AliveReplayBuffer
 from sb3_flock.rl.callbacks import (
     DivergedError,
+    DropDeadTransitions,
     FlockMetrics,
     LinearNoiseDecay,
     StopOnNonFiniteLoss,
     StoreExecutedActions,
 )
 from sb3_flock.settings import SettingsError
+from tests.envs.scripted import LIVES, Scripted
 
 CROWDED = Scenario(n_vehicles=4, n_obstacles=1, arena=0.2, obstacle_arena=0.4, neighbor_separation=0.02, max_cycles=5)
 
@@ -89,6 +92,13 @@ def test_neighbors_at_the_end_of_an_episode_are_those_of_its_last_step():
     np.testing.assert_allclose(model.replay_buffer.rewards[4], expected_mix(infos, 4, 0.5), rtol=1e-5)
 
 
+def test_neighbors_in_a_resets_infos_are_not_those_of_the_last_step():
+    env = flatten(Scripted(dict.fromkeys("abcd", (0, 3, "truncation"))), 2, seed=0)  # a reset names d, each step a
+    model = learn(env, NeighborInclusiveReward(0.5), 7)
+    mixed = np.tile(0.5 * np.array([10, 20, 30, 40]) + 0.5 * 10, 2)
+    np.testing.assert_array_equal(model.replay_buffer.rewards[:7], np.tile(mixed, (7, 1)))
+
+
 def test_mixed_rewards_with_n_step_returns():
     record = Record()
     model = learn(make_vec_env(CROWDED, n_flocks=1, seed=3), [NeighborInclusiveReward(0.5), record], 5, FlockCNN, n_steps=3)
@@ -146,6 +156,12 @@ def test_an_agent_without_neighbors_in_its_info_keeps_its_reward():
     np.testing.assert_array_equal(callback.mix(np.array([1.0, 3.0]), [{}, {"neighbors": [0]}]), [1.0, 2.0])
 
 
+def test_a_neighbor_that_did_not_act_does_not_count():
+    callback = NeighborInclusiveReward(0.5, n_agents=3)
+    infos = [{"neighbors": [1, 2]}, {"alive": False}, {"neighbors": [1]}]
+    np.testing.assert_array_equal(callback.mix(np.array([1.0, 0.0, 5.0]), infos), [3.0, 0.0, 5.0])
+
+
 def test_the_mixed_return_is_logged_under_its_own_name(tmp_path):
     record = Record()
     env = VecMonitor(make_vec_env(CROWDED, n_flocks=1, seed=1))
@@ -164,10 +180,34 @@ def test_the_mixed_return_is_logged_under_its_own_name(tmp_path):
     assert any(row["flock/connectivity"] for row in logged)
 
 
-def test_vec_normalize_is_refused():
+def test_vec_normalize_is_refused_off_policy():
     env = VecNormalize(make_vec_env(CROWDED, n_flocks=1, seed=1), norm_reward=False)
-    with pytest.raises(SettingsError, match="VecNormalize is not accepted"):
+    with pytest.raises(SettingsError, match="VecNormalize is not accepted with DDPG"):
         learn(env, NeighborInclusiveReward(), 1, FlockCNN)
+
+
+class MixThenNormalize(Record):
+    """The normalized mix by the formula, with the statistics of each step."""
+
+    def _on_step(self):
+        super()._on_step()
+        raw = [sum(info["reward_terms"].values()) for info in self.locals["infos"]]
+        np.testing.assert_allclose([info["reward"] for info in self.locals["infos"]], raw, rtol=1e-5)
+        mixed = np.array(expected_mix(self.locals["infos"], 4, 0.7))
+        self.steps[-1] += (mixed, self.training_env.normalize_reward(mixed))
+        return True
+
+
+@pytest.mark.parametrize("options", [{}, {"norm_reward": False}, {"clip_reward": 0.5}], ids=str)
+def test_on_policy_rewards_are_mixed_and_then_normalized(options):
+    env = VecMonitor(VecNormalize(make_vec_env(CROWDED.replace(max_cycles=40), n_flocks=2, seed=1), **options))
+    model = PPO("MlpPolicy", env, policy_kwargs={"net_arch": [8]}, n_steps=8, batch_size=64, device="cpu", seed=0)
+    record, callback = MixThenNormalize(), NeighborInclusiveReward(0.7)
+    model.learn(8 * env.num_envs, callback=[callback, record])
+    np.testing.assert_allclose(model.rollout_buffer.rewards, [step[-1] for step in record.steps], rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(callback._returns, np.sum([step[-2] for step in record.steps], 0), rtol=1e-4)
+    changes = [np.abs(mixed - [info["reward"] for info in infos]) > 1e-6 for _, infos, _, mixed, _ in record.steps]
+    assert np.sum(changes) > 10
 
 
 def test_a_wrong_or_missing_number_of_agents_is_refused():
@@ -220,6 +260,84 @@ def test_flock_metrics_are_means_without_the_experts_steps():
     learn(env, [ExpertDrivesVehicle1(), FlockMetrics(), record], 5, FlockCNN)
     errors = [info["metrics"]["tracking_error"] for _, infos, _ in record.steps for info in (infos[0], *infos[2:])]
     assert record.logged[-1]["flock/tracking_error"] == pytest.approx(np.mean(errors))
+
+
+class VehicleIsGone(ExpertDrivesVehicle1):
+    def _on_step(self):
+        super()._on_step()
+        self.locals["infos"][1] = {"alive": False}
+        return True
+
+
+def test_flock_metrics_leave_out_slots_without_an_agent():
+    env, record = make_vec_env(CROWDED, n_flocks=1, seed=1), Record()
+    learn(env, [VehicleIsGone(), FlockMetrics(), record], 5, FlockCNN)
+    errors = [info["metrics"]["tracking_error"] for _, infos, _ in record.steps for info in (infos[0], *infos[2:])]
+    assert record.logged[-1]["flock/tracking_error"] == pytest.approx(np.mean(errors))
+
+
+OFF_POLICY = {
+    "buffer_size": 400,
+    "learning_starts": 30,
+    "batch_size": 16,
+    "policy_kwargs": {"net_arch": [8]},
+    "device": "cpu",
+}
+
+
+@pytest.mark.parametrize("buffer", [None, AliveReplayBuffer, CompactReplayBuffer])
+def test_off_policy_only_the_steps_of_living_agents_are_learned_from(buffer):
+    seen = []
+
+    class Watched(DDPG):
+        def train(self, *args, **kwargs):
+            seen.append(self.replay_buffer.sample(64))
+            super().train(*args, **kwargs)
+
+    model = Watched("MlpPolicy", flatten(Scripted(), 2, seed=0), replay_buffer_class=buffer, **OFF_POLICY)
+    model.learn(30 * model.n_envs, callback=DropDeadTransitions() if buffer is None else None)
+    observations = np.concatenate([batch.observations for batch in seen])
+    rewards = np.concatenate([batch.rewards for batch in seen])
+    assert len(observations) > 500
+    np.testing.assert_array_equal(rewards[:, 0], 10 * observations[:, 0])
+    assert set(observations[:, 0]) == {1, 2, 3, 4}
+    steps = np.concatenate([batch.next_observations for batch in seen])[:, 1]
+    np.testing.assert_array_equal(steps, observations[:, 1] + 1)
+    ends = np.isin(observations[:, 0], [1, 3]) & np.isin(steps - 1, [3, 5]) & ((observations[:, 0] == 1) == (steps == 4))
+    np.testing.assert_array_equal(np.concatenate([batch.dones for batch in seen])[:, 0], ends)  # b and d are truncated
+
+
+@pytest.mark.parametrize("algorithm", [PPO, A2C])
+def test_on_policy_only_the_steps_of_living_agents_are_learned_from(algorithm):
+    batches = []
+
+    class Watched(algorithm):
+        def train(self):
+            batches.extend(self.rollout_buffer.get(32))
+            super().train()
+
+    options = {"batch_size": 32} if algorithm is PPO else {}
+    model = Watched("MlpPolicy", flatten(Scripted(), 2, seed=0), n_steps=12, device="cpu", seed=0, **options)
+    model.learn(3 * 12 * model.n_envs, callback=DropDeadTransitions())
+    steps = 3 * 2 * 2 * sum(end - start for start, end, _ in LIVES.values())  # rollouts of two episodes, of two copies
+    observations = np.concatenate([batch.observations for batch in batches])
+    assert len(observations) == steps
+    assert (observations[:, 0] > 0).all()
+    assert {len(batch.observations) for batch in batches} == {32, steps // 3 % 32}
+
+
+def test_a_model_whose_buffer_cannot_drop_steps_is_refused_in_one_line():
+    env = flatten(Scripted(), seed=0)
+    model = DDPG("MlpPolicy", env, **OFF_POLICY)
+    model.learn(8)
+    n_step = DDPG("MlpPolicy", env, n_steps=3, **OFF_POLICY)
+    for one, name in ((model, "ReplayBuffer"), (n_step, "NStepReplayBuffer")):
+        with pytest.raises(SettingsError, match=f"^DropDeadTransitions: the model has a {name}; SB3's own"):
+            one.learn(8, callback=DropDeadTransitions())
+    again = DDPG("MlpPolicy", env, **OFF_POLICY)
+    for _ in range(2):
+        again.learn(8, callback=DropDeadTransitions(), reset_num_timesteps=False)
+    assert again.replay_buffer.size() == 13  # of four vector steps; a died after three, c joined after two
 
 
 @pytest.mark.parametrize("name", ["train/actor_loss", "train/bc_loss"])

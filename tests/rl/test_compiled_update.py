@@ -7,6 +7,7 @@ from copy import deepcopy
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
 from sb3_flock import CompactReplayBuffer, FlockCNN, make_vec_env
@@ -120,6 +121,21 @@ def test_with_other_parts_torch_updates(parts):
     before = model.policy.state_dict()["critic.qf0.0.weight"].clone()
     updated(model, 2)
     assert not th.equal(before, model.policy.state_dict()["critic.qf0.0.weight"])
+
+
+def test_with_vec_normalize_torch_updates_from_normalized_samples():
+    env = VecNormalize(make_vec_env(n_flocks=2, seed=0), clip_obs=0.01, clip_reward=0.02)
+    options = {"learning_starts": 60, "buffer_size": 600, "batch_size": 16, "device": "cpu", "seed": 0}
+    model = FlockTD3(FlockPolicy, env, replay_buffer_class=CompactReplayBuffer, **options)
+    model.learn(120)
+    assert not can_compile(model)
+    observations = model.replay_buffer.sample(50, env).observations
+    assert observations.abs().max() == np.float32(0.01)
+    assert model.replay_buffer.sample(50, env).rewards.abs().max() <= 0.02
+    seen = []
+    model.critic.features_extractor.register_forward_hook(lambda module, inputs, output: seen.append(inputs[0]))
+    model.train(2, 16)
+    assert max(inputs.abs().max() for inputs in seen) == np.float32(0.01)
 
 
 def test_frozen_weights_stay_where_they_are():

@@ -4,6 +4,7 @@ import torch as th
 from stable_baselines3 import DDPG
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.torch_layers import FlattenExtractor
+from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
 from sb3_flock import CompactReplayBuffer, FlockCNN, FlockDDPG, FlockPolicy, make_vec_env
 from sb3_flock._renamed import RenamedWarning
@@ -11,10 +12,10 @@ from sb3_flock.settings import SettingsError
 from tests.helpers import PlainCNN
 
 
-def model(algorithm, extractor, fused, **kwargs):
+def model(algorithm, extractor, fused, wrap=lambda env: env, **kwargs):
     built = algorithm(
         FlockPolicy,
-        make_vec_env(n_flocks=2, seed=0),
+        wrap(make_vec_env(n_flocks=2, seed=0)),
         buffer_size=1200,
         learning_starts=600,
         action_noise=None,
@@ -35,11 +36,11 @@ def model(algorithm, extractor, fused, **kwargs):
     return built
 
 
-@pytest.mark.parametrize("n_critics", [1, 2])
-def test_fifty_updates_equal_those_of_sb3s_ddpg_with_torchs_convolutions_up_to_rounding(n_critics):
+@pytest.mark.parametrize(("n_critics", "wrap"), [(1, VecMonitor), (2, VecMonitor), (2, VecNormalize)])
+def test_fifty_updates_equal_those_of_sb3s_ddpg_with_torchs_convolutions_up_to_rounding(n_critics, wrap):
     ours, sb3 = (
-        model(FlockDDPG, FlockCNN, True, n_critics=n_critics),
-        model(DDPG, PlainCNN, False, n_critics=n_critics),
+        model(FlockDDPG, FlockCNN, True, wrap, n_critics=n_critics),
+        model(DDPG, PlainCNN, False, wrap, n_critics=n_critics),
     )
     start = [parameter.clone() for parameter in ours.policy.parameters()]
     for one in (ours, sb3):

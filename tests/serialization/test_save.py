@@ -4,10 +4,12 @@ from importlib.metadata import version
 
 import numpy as np
 import pytest
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_flock import FlockDDPG, load_policy, make_vec_env, save_model
 from sb3_flock.rl.registry import build_model
 from sb3_flock.serialization.save import atomic_write, versions
+from sb3_flock.settings import SettingsError
 from tests.helpers import SMALL_MODEL
 
 
@@ -56,6 +58,14 @@ def test_the_json_member_holds_the_config_the_transitions_and_the_versions(tmp_p
     assert member["num_timesteps"] == 9
     assert member["versions"] == versions()
     assert member["versions"]["torch"] == version("torch")
+
+
+def test_a_model_that_flies_on_normalized_observations_is_refused_in_one_line(tmp_path):
+    env = VecNormalize(make_vec_env(SMALL_MODEL.scenario, 1, seed=0))
+    with pytest.raises(SettingsError, match="^save_model: VecNormalize normalizes the model's observations"):
+        save_model(build_model(SMALL_MODEL, env), tmp_path / "policy.zip", SMALL_MODEL)
+    env = VecNormalize(make_vec_env(SMALL_MODEL.scenario, 1, seed=0), norm_obs=False)
+    save_model(build_model(SMALL_MODEL, env), tmp_path / "policy.zip", SMALL_MODEL)
 
 
 def test_a_write_that_fails_leaves_the_earlier_file_and_nothing_else(tmp_path):
