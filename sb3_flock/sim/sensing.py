@@ -31,7 +31,7 @@ class SensingSettings(Settings):
     obstacle_separation: NotNegative = Field(0.15, description="minimum separation to obstacles r_o' [m] (paper: 0.15)")
     shared_detections: bool = Field(
         False,
-        description="neighbors tell each other by communication where the obstacles are that they detect (paper: false)",
+        description="neighbors share by communication where the obstacles are that they detect (paper: false)",
     )
 
     @model_validator(mode="after")
@@ -43,7 +43,7 @@ class SensingSettings(Settings):
 
     @property
     def known_obstacle_range(self) -> float:
-        """Distance within which every obstacle lies that a vehicle detects or is told of [m]."""
+        """Distance within which every obstacle lies that a vehicle or one of its neighbors detects [m]."""
         return self.detection_range + (self.link_range if self.shared_detections else 0.0)
 
 
@@ -187,10 +187,10 @@ def share_detections(
     :param obstacle_positions: ``(flocks, obstacles, 2)`` [m]
     """
     n_obstacles, counts = obstacle_positions.shape[1], detected.count().ravel()
-    told = counts[neighbors.vehicles]  # how many obstacles each neighbor tells of
-    first = np.repeat((np.cumsum(counts) - counts)[neighbors.vehicles] - (np.cumsum(told) - told), told)
+    shared = counts[neighbors.vehicles]  # how many obstacles each neighbor detects
+    first = np.repeat((np.cumsum(counts) - counts)[neighbors.vehicles] - (np.cumsum(shared) - shared), shared)
     bodies = detected.bodies[first + np.arange(len(first))]
-    observers = np.concatenate((detected.observers, np.repeat(neighbors.observers, told)))
+    observers = np.concatenate((detected.observers, np.repeat(neighbors.observers, shared)))
     observers, bodies = np.divmod(
         np.unique(observers * n_obstacles + np.concatenate((detected.bodies, bodies))), n_obstacles
     )

@@ -111,7 +111,7 @@ def test_connectivity_of_chains_and_islands(links, n, connected):
 
 @pytest.mark.parametrize("compiled", [True, False])
 @pytest.mark.parametrize("seed", range(5))
-def test_neighbors_tell_each_other_of_the_obstacles_that_they_detect(seed, compiled, monkeypatch):
+def test_neighbors_share_the_obstacles_that_they_detect(seed, compiled, monkeypatch):
     if not compiled:
         monkeypatch.setattr(sensing, "compiled", lambda *names: None)
     rng, task = np.random.default_rng(seed), Scenario(n_vehicles=6, n_obstacles=3, neighbor_separation=0.01)
@@ -126,14 +126,14 @@ def test_neighbors_tell_each_other_of_the_obstacles_that_they_detect(seed, compi
         rows = zip(contacts.observers.tolist(), contacts.bodies.tolist(), strict=True)
         return dict(zip(rows, np.column_stack((contacts.positions, contacts.distances)).tolist(), strict=True))
 
-    own, told = known(alone.obstacles), known(together.obstacles)
+    own, shared = known(alone.obstacles), known(together.obstacles)
     links = list(zip(alone.neighbors.observers.tolist(), alone.neighbors.vehicles.tolist(), strict=True))
     expected = {*own, *((i, body) for i, j in links for vehicle, body in own if vehicle == j)}
-    assert list(told) == sorted(expected)
-    assert len(own) < len(told) < 4 * 6 * 3
-    assert own.items() <= told.items()  # what a vehicle detects itself stays as it is, to the last bit
-    assert all(row[2] < world.scenario.known_obstacle_range for row in told.values())
-    for (i, body), (x, y, distance) in told.items():
+    assert list(shared) == sorted(expected)
+    assert len(own) < len(shared) < 4 * 6 * 3
+    assert own.items() <= shared.items()  # what a vehicle detects itself stays as it is, to the last bit
+    assert all(row[2] < world.scenario.known_obstacle_range for row in shared.values())
+    for (i, body), (x, y, distance) in shared.items():
         flock, vehicle = divmod(i, 6)
         offset = world.obstacle_positions[flock, body] - world.positions[flock, vehicle]
         cos, sin = world.frames[flock, vehicle]
