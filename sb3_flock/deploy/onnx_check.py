@@ -35,13 +35,17 @@ class _Sample:
     """What the vehicles ask for, ``(1, vehicles, 2)``."""
 
 
-def compare(session: Any, policy: LoadedPolicy, scenario: Scenario, n_samples: int, seed: int) -> tuple[float, float]:
+def compare(
+    session: Any, policy: LoadedPolicy, scenario: Scenario, n_samples: int, seed: int, reserve: float = 0.0
+) -> tuple[float, float]:
     """Largest difference of a graph to ``predict``, as a share of the action's range, and median time of a decision [s].
 
     With a filter the difference is that to the filtered action, and to the speed to announce.
 
-    :param session: an ``onnxruntime.InferenceSession`` of the graph
+    :param session: an ``onnxruntime.InferenceSession`` of the graph, or what has its ``run``
+    :param reserve: a filter may be as slow as with a ``safety_margin`` that is larger by this [m]
     """
+    wider = scenario.model_copy(update={"safety_margin": scenario.safety_margin + reserve})
     space: Any = policy.policy.action_space
     width, outputs, times, differences = space.high - space.low, [], [], []
     samples = list(_random_samples(scenario, n_samples, seed))
@@ -51,10 +55,11 @@ def compare(session: Any, policy: LoadedPolicy, scenario: Scenario, n_samples: i
         times.append(time.perf_counter() - start)
     for sample, (action, *announced) in zip(samples, outputs, strict=True):
         asked = policy.predict(observe(sample.sensing, scenario)[0, 0], deterministic=True)[0]
-        expected, announcement = _executed(sample, asked, scenario)
-        differences += [(np.abs(action - expected) / width).max()]
-        differences += [np.abs(speed - announcement) / width[0] for speed in announced]
-    return float(max(differences)), float(np.median(times))
+        highest, lowest = (np.append(*_executed(sample, asked, task)) for task in (scenario, wider))
+        for found, columns in ((action, slice(2)), *((speed, 2) for speed in announced)):
+            outside = np.maximum(found - highest[columns], lowest[columns] - found)
+            differences += [np.max(outside / (width if len(np.shape(found)) else width[0]))]
+    return float(np.max(differences)), float(np.median(times))
 
 
 def decide(session: Any, inputs: SampleInput) -> list[NDArray[np.float64]]:
