@@ -7,6 +7,7 @@ import ctypes
 import shutil
 import subprocess
 import tempfile
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +16,7 @@ import numpy as np
 from sb3_flock.settings import RunError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -107,6 +108,15 @@ class CLibrary:
             struct["neighbor_headings"][0, : len(inputs["neighbor_headings"])] = inputs["neighbor_headings"]
         return struct
 
+    def latency(self, samples: Iterable[SampleInput]) -> float:
+        """Median time of a call of ``flock_decide`` [s]."""
+        output, times = np.zeros(1, self.output), []
+        for struct in [self.struct_of(inputs) for inputs in samples]:
+            start = time.perf_counter()
+            self.call("flock_decide", struct, output)
+            times.append(time.perf_counter() - start)
+        return float(np.median(times))
+
     def run(self, names: Sequence[str] | None, inputs: SampleInput) -> list[NDArray[np.float32]]:
         """Outputs by name, as an ONNX session gives them; all of them for ``None``."""
         struct, output = self.struct_of(inputs), np.zeros(1, self.output)
@@ -116,7 +126,7 @@ class CLibrary:
             announced[0, : len(inputs["neighbor_announced_speeds"])] = inputs["neighbor_announced_speeds"]
             self.call("flock_raise_speed", struct, announced, output)
         results = {"action": np.array([output["speed"][0], output["turn_rate"][0]])}
-        if "announced_speed" in self.output.fields:
+        if self.scenario.safety_filter == "announce":
             results["announced_speed"] = output["announced_speed"][0]
         return [results[name] for name in (results if names is None else names)]
 
