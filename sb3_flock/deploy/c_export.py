@@ -33,7 +33,7 @@ TOLERANCE = 1e-4
 RESERVE = 2.0**-20
 """What the filter keeps beyond a separation for float32's errors [sensing ranges], instead of
 :data:`~sb3_flock.sim.safety.ROUNDING`. It is 16 times float32's unit roundoff of 2^-24. A vehicle's own errors add up to at most
-12 of these: 4 of the gap, 5 of the approach, 3 of what an announcement adds."""
+13 of these: 4 of the gap, 5 of the approach, 4 of what an announcement adds."""
 
 _DIRECTION_RESERVE = 2.0**-19
 """By how much a neighbor's heading has to recede; relative headings of up to 2 pi, their cosines and sines are off by 8e-7."""
@@ -188,15 +188,15 @@ def _constants(scenario: Scenario) -> Iterator[str]:
             ("NEIGHBOR_KEPT", _float(scenario.neighbor_separation + margin, up=True), "separation and margin [m]"),
             ("NEIGHBOR_REACH", _float(scenario.link_range * reach, up=True), "range of the filter [m]"),
         ]
+    turned = _infers_motion(scenario)
+    if turned or scenario.safety_filter in {"heading", "announce"}:
+        numbers += [("FULL_TURN", _float(2 * np.pi, up=True), "largest angle that is precise enough in float32 [rad]")]
     if scenario.safety_filter in {"heading", "announce"}:
-        numbers += [
-            ("FULL_TURN", _float(2 * np.pi, up=True), "[rad]"),
-            ("DIRECTION_RESERVE", _float(_DIRECTION_RESERVE), "for errors of directions in float32"),
-        ]
-    if turned := _infers_motion(scenario):
+        numbers += [("DIRECTION_RESERVE", _float(_DIRECTION_RESERVE), "for errors of directions in float32")]
+    if turned:
         numbers += [
             ("SIN_TURNED", _float(np.sin(turned), up=True), "of how far a neighbor turns within motion_lag"),
-            ("MOTION_RESERVE", _float(RESERVE * motion_reach, up=True), "for errors of motions in float32 [m]"),
+            ("MOTION_RESERVE", _float(2 * RESERVE * motion_reach, up=True), "for errors of motions in float32 [m]"),
         ]
     if scenario.obstacle_filter:
         numbers += [

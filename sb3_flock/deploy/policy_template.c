@@ -379,7 +379,8 @@ static float flock_receding(const FlockInput *input, int i, float distance)
     const FlockPoint point = input->now.neighbors[i], before = flock_to_present(input->previous.neighbors[i], &frame);
     FlockPoint motion;
     float away;
-    if (!(flock_distance(input->previous.neighbors[i]) < FLOCK_LINK_RANGE) || !(distance > 0.0f)) {
+    if (!(flock_distance(input->previous.neighbors[i]) < FLOCK_LINK_RANGE) || !(distance > 0.0f) ||
+        !(input->ego_turn >= -FLOCK_FULL_TURN && input->ego_turn <= FLOCK_FULL_TURN)) {
         return -1.0f;
     }
     motion.x = point.x - before.x;

@@ -375,6 +375,26 @@ def test_a_program_includes_the_declarations_and_needs_nothing_else(small, tmp_p
     assert needed <= {"expf", "sqrtf", "cosf", "sinf", "memset", "memcpy"}
 
 
+def test_the_program_in_the_documentation_compiles(tmp_path):
+    page = (Path(__file__).parents[2] / "docs" / "deploy.md").read_text(encoding="utf-8")
+    policy = load_policy("ddpg-bc-3v1o")
+    (tmp_path / "policy.c").write_text(source_of(policy, policy.scenario.replace(safety_filter="announce")))
+    (tmp_path / "vehicle.c").write_text(page.split("```c\n")[1].split("```")[0])
+    assert compile_with(tmp_path, *c_check.FLAGS, "-c", "vehicle.c").stderr == ""
+
+
+@pytest.mark.parametrize(("turn", "speed"), [(0.0, 0.1), (3.0, 0.1), (7.0, 0.05), (1e9, 0.05)])
+def test_a_motion_counts_unless_the_own_turn_is_of_unknown_precision(library, turn, speed):
+    built = library(Scenario(safety_filter="motion", motion_lag=0.2))
+    struct, output = np.zeros(1, built.input), np.zeros(1, built.output)
+    struct["now"]["n_neighbors"] = struct["previous"]["n_neighbors"] = 1
+    struct["now"]["neighbors"][0, 0] = (0.11, 0.0)
+    struct["previous"]["neighbors"][0, 0] = (0.105 * np.cos(turn), 0.105 * np.sin(turn))
+    struct["ego_motion"], output["asked_speed"] = (0.0, 0.0, turn), 9.0
+    assert built.call("flock_filter", struct, output) == [0]
+    assert output["speed"] == pytest.approx(speed, rel=1e-3)
+
+
 def test_fast_math_is_refused(small, tmp_path):
     (tmp_path / "policy.c").write_text(source_of(small, small.scenario))
     assert "compile without -ffast-math" in compile_with(tmp_path, "-c", "-ffast-math", "policy.c").stderr
@@ -419,7 +439,7 @@ def test_networks_and_channels_without_c_are_one_line(small, tmp_path, restored)
 
 def test_a_file_that_acts_otherwise_or_does_not_compile_is_not_written(small, tmp_path, monkeypatch):
     right = c_export.source_of
-    monkeypatch.setattr(c_export, "source_of", lambda *_: right(*_).replace("speed = ", "speed = 0.01f + "))
+    monkeypatch.setattr(c_export, "source_of", lambda *_: right(*_).replace("\n    speed = ", "\n    speed = 0.01f + "))
     with pytest.raises(RunError, match="differs from the policy by 0.067 of the range, more than 0.0001"):
         export_c(small, tmp_path / "policy.c", n_samples=30)
     monkeypatch.setattr(c_export, "source_of", lambda *_: "no C")
