@@ -25,7 +25,7 @@ def announcing(model):
 
 
 def test_the_first_compiler_on_the_path_is_taken(monkeypatch):
-    monkeypatch.setattr(shutil, "which", lambda name: {"gcc": "/bin/gcc", "clang": "/bin/clang"}.get(name))
+    monkeypatch.setattr(shutil, "which", {"gcc": "/bin/gcc", "clang": "/bin/clang"}.get)
     assert compiler() == "/bin/gcc"
     monkeypatch.setattr(shutil, "which", lambda name: None)
     assert compiler() is None

@@ -2,6 +2,7 @@
 
 import re
 import subprocess
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
@@ -36,8 +37,6 @@ def small(model):
 @pytest.fixture
 def library(small):
     """A function that compiles a scenario; the libraries stay as long as the test."""
-    from contextlib import ExitStack
-
     with ExitStack() as stack:
         yield lambda scenario, *n_bodies: stack.enter_context(library_of(source_of(small, scenario), scenario, *n_bodies))
 
@@ -235,8 +234,8 @@ def test_what_is_not_received_or_senseless_is_not_used(announcing, headings, ann
 
 def test_speeds_are_rounded_down(announcing):
     rng = np.random.default_rng(0)
-    for distance in rng.uniform(0.1, 0.13, 200):
-        x, y = np.float32(distance * np.cos([1.0, 2.0])[0]), np.float32(distance * np.sin(1.0))
+    for distance, angle in rng.uniform((0.1, 0.0), (0.13, 1.5), (200, 2)):
+        x, y = np.float32(distance * np.cos(angle)), np.float32(distance * np.sin(angle))
         speed, _ = announcing(neighbors=[(x, y)], announced=[0.0], asked=9.0)
         exact = np.hypot(float(x), float(y))
         assert speed * 0.1 * float(x) / exact <= max(exact - 0.1, 0.0)
