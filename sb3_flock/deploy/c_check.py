@@ -40,7 +40,7 @@ def library_of(source: str, scenario: Scenario, n_bodies: tuple[int, int] = N_BO
     :param n_bodies: most neighbors and obstacles of an input
     :raises RunError: if it does not compile
     """
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:  # Windows keeps a loaded library
         written, library = Path(folder, "policy.c"), Path(folder, "policy.so")
         written.write_text(source, "ascii")
         sizes = [f"-DFLOCK_MAX_{name}={n}" for name, n in zip(("NEIGHBORS", "OBSTACLES"), n_bodies, strict=True)]
