@@ -16,6 +16,7 @@ from sb3_flock import _renamed
 if TYPE_CHECKING:
     from sb3_flock.config.training import TrainingConfig
     from sb3_flock.controllers import Controller, make_controller, register_controller
+    from sb3_flock.deploy.c_export import export_c
     from sb3_flock.deploy.onnx_export import export
     from sb3_flock.envs import flocking_v0
     from sb3_flock.envs.expert_env import ExpertEnv
@@ -52,6 +53,7 @@ __all__ = [
     "World",
     "evaluate",
     "export",
+    "export_c",
     "flatten",
     "flocking_v0",
     "load_policy",
@@ -86,6 +88,7 @@ _HOMES = {
     "World": "sim",
     "evaluate": "evaluation",
     "export": "deploy.onnx_export",
+    "export_c": "deploy.c_export",
     "flatten": "envs.vec_env",
     "load_policy": "serialization.load",
     "make_controller": "controllers",

@@ -20,7 +20,7 @@ COMMANDS = {
     "evaluate": "simulate many episodes of a policy and print its metrics",
     "render": "simulate one episode and write a figure, a video or a web page",
     "play": "simulate live in a window, with mouse and keys",
-    "export": "write a policy as ONNX, for a vehicle's computer",
+    "export": "write a policy as ONNX or C, for a vehicle's computer",
     "compare": "show trainings side by side",
     "reproduce": "write the paper's tables and figures with ours",
     "sweep": "train or evaluate at many settings, also on a Ray cluster",

@@ -1,1 +1,1 @@
-"""Policies outside this package: ONNX."""
+"""Policies outside this package: ONNX, and C for microcontrollers."""

@@ -74,14 +74,7 @@ class OnnxPolicy(nn.Module):
     def __init__(self, policy: Any, scenario: Scenario) -> None:
         super().__init__()
         self.scenario = scenario
-        actor: Any = getattr(policy, "actor", None)
-        if isinstance(policy, TD3Policy):
-            parts = [actor.features_extractor, actor.mu]
-        elif isinstance(policy, SACPolicy):
-            parts = [actor.features_extractor, actor.latent_pi, actor.mu, nn.Tanh()]
-        else:
-            raise SettingsError(f"export: a policy of DDPG, TD3 or SAC is needed, not {type(policy).__name__}")
-        self.actor = copy.deepcopy(nn.Sequential(*parts)).double()
+        self.actor = copy.deepcopy(actor_of(policy)).double()
         self.register_buffer("low", th.tensor(policy.action_space.low, dtype=th.float64))
         self.register_buffer("high", th.tensor(policy.action_space.high, dtype=th.float64))
 
@@ -137,6 +130,19 @@ class OnnxPolicy(nn.Module):
         gaussians = (factors[:, 0, :, None] * factors[:, 1, None, :]).flatten(1)
         counts = (channel_of == th.arange(len(radii))[:, None]) & visible
         return (counts.double() @ gaussians).view(len(radii), side, side)
+
+
+def actor_of(policy: Any) -> nn.Sequential:
+    """The parts of an actor: features extractor, dense layers and bound, from observations to actions in [-1, 1].
+
+    :raises SettingsError: for a policy of another kind than those of DDPG, TD3 and SAC
+    """
+    actor: Any = getattr(policy, "actor", None)
+    if isinstance(policy, TD3Policy):
+        return nn.Sequential(actor.features_extractor, actor.mu)
+    if isinstance(policy, SACPolicy):
+        return nn.Sequential(actor.features_extractor, actor.latent_pi, actor.mu, nn.Tanh())
+    raise SettingsError(f"export: a policy of DDPG, TD3 or SAC is needed, not {type(policy).__name__}")
 
 
 def _to_present(ego_motion: th.Tensor) -> Callable[[th.Tensor], th.Tensor]:
@@ -298,35 +304,27 @@ _INPUTS_OF_LEVELS = {
 
 
 def _metadata(policy: LoadedPolicy, scenario: Scenario) -> dict[str, Any]:
-    names = (
-        "link_range",
-        "detection_range",
-        "shared_detections",
-        "neighbor_separation",
-        "obstacle_separation",
-        "time_step",
-        "max_speed",
-    )
     inputs = "positions in the body frame [m], forward +x, left +y: neighbors (any, 2), obstacles (any, 2), waypoint (2,)"
     if scenario.shared_detections:
         inputs += "; obstacles are those that the vehicle or one of its neighbors detects"
     if scenario.motion_lag:
         inputs += "; previous_...: those of motion_lag [s] ago, in the frame of that time"
         inputs += "; ego_motion (3,): present position in that frame [m], turn since [rad]"
-    outputs, settings = "action (2,): speed [m/s], turn rate [rad/s]", [*names, "max_turn_rate", "motion_lag"]
+    outputs = "action (2,): speed [m/s], turn rate [rad/s]"
     if scenario.is_filtered:
-        settings += ["safety_filter", "obstacle_filter", "safety_margin", "obstacle_max_speed"]
         inputs += _INPUTS_OF_LEVELS.get(scenario.safety_filter, "")
     if scenario.safety_filter == "announce":
         outputs += "; announced_speed (): to send to the neighbors [m/s]"
-    return {
-        **policy.describe(),
-        "policy": policy.path.name,
-        "inputs": inputs,
-        "output": outputs,
-        **{name: getattr(scenario, name) for name in settings},
-        "exported_with": versions(),
-    }
+    return {**metadata_of(policy, scenario), "inputs": inputs, "output": outputs, "exported_with": versions()}
+
+
+def metadata_of(policy: LoadedPolicy, scenario: Scenario) -> dict[str, Any]:
+    """What every exported file says about its policy and its task, as plain values."""
+    names = ["link_range", "detection_range", "shared_detections", "neighbor_separation", "obstacle_separation"]
+    names += ["time_step", "max_speed", "max_turn_rate", "motion_lag"]
+    if scenario.is_filtered:
+        names += ["safety_filter", "obstacle_filter", "safety_margin", "obstacle_max_speed"]
+    return {**policy.describe(), "policy": policy.path.name, **{name: getattr(scenario, name) for name in names}}
 
 
 @contextlib.contextmanager

@@ -92,6 +92,12 @@ class OnnxFilter:
     def _received(self, values):
         return np.where(self.rng.random(values.shape) < self.lost, np.nan, values)
 
+    def check(self, world, executed, expected):
+        """Compare executed actions with those of ``filter_actions``."""
+        np.testing.assert_array_equal(executed[..., 1], expected[..., 1])
+        strides = (executed[..., 0] - expected[..., 0])[has_clear_signs(world)] * self.scenario.time_step
+        assert np.abs(strides).max(initial=0) < 1e-9 * self.scenario.neighbor_separation
+
 
 def has_clear_signs(world):
     """The flocks in which it does not depend on rounding whether a neighbor approaches or recedes, ``(flocks,)``."""
@@ -102,9 +108,9 @@ def has_clear_signs(world):
     return np.bincount(contacts.observers // contacts.shape[1], unclear, minlength=contacts.shape[0]) == 0
 
 
-def simulate(onnx_filter, driver, n_flocks, seed, is_packed):
-    """Simulate a driver behind the graph's filter; no violation may occur. The number of simulated vehicle-steps."""
-    scenario, rng = onnx_filter.scenario, np.random.default_rng(seed)
+def simulate(exported_filter, driver, n_flocks, seed, is_packed):
+    """Simulate a driver behind an exported filter; no violation may occur. The number of simulated vehicle-steps."""
+    scenario, rng = exported_filter.scenario, np.random.default_rng(seed)
     world = World(scenario.replace(safety_filter="off", obstacle_filter=False), n_flocks)
     sensing = world.reset([episode_rng(seed, episode) for episode in range(n_flocks)])
     if is_packed:
@@ -115,13 +121,11 @@ def simulate(onnx_filter, driver, n_flocks, seed, is_packed):
         measured = world.sensors.measure(sensing)
         positions.append(world.positions)
         asked = driver(world, rng)
-        executed = onnx_filter(world, asked, positions[0])
-        if not onnx_filter.lost:
+        executed = exported_filter(world, asked, positions[0])
+        if not exported_filter.lost:
             asked = np.clip(asked, world.action_low, world.action_high)
             expected = filter_actions(asked, measured, scenario, world.frames)
-            np.testing.assert_array_equal(executed[..., 1], expected[..., 1])
-            strides = (executed[..., 0] - expected[..., 0])[has_clear_signs(world)] * scenario.time_step
-            assert np.abs(strides).max(initial=0) < 1e-9 * scenario.neighbor_separation
+            exported_filter.check(world, executed, expected)
         sensing, _ = world.step(executed)
         assert sensing.neighbors.count(scenario.neighbor_separation).sum() == 0
     return n_flocks * scenario.n_vehicles * scenario.max_cycles
@@ -333,9 +337,12 @@ def in_frame(position, heading, points):
 
 
 def test_a_flock_of_onboard_computers_flies_as_the_world_does(exported, policy):
-    """Each vehicle runs the file with what it measures and receives, as a control engineer would write it."""
     scenario, result = exported
-    session = session_of(str(result.path))
+    fly_as_the_world_does(session_of(str(result.path)), scenario, policy)
+
+
+def fly_as_the_world_does(session, scenario, policy):
+    """Each vehicle runs the file with what it measures and receives, as a control engineer would write it."""
     task = scenario.replace(n_vehicles=4, n_obstacles=1, arena=0.3, max_cycles=60)
     world, other = World(task), World(task.replace(safety_filter="off", obstacle_filter=False))
     controller = as_controller(policy, task)
