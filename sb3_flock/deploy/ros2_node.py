@@ -59,7 +59,7 @@ class Ros2Settings(Settings):
                 raise ValueError(
                     f"{name} = {getattr(self, name)!r}: {number} is needed, the number of one of {count} bodies"
                 )
-        if self.announcement_wait * self.rate >= 1:
+        if not self.lockstep and self.announcement_wait * self.rate >= 1:
             raise ValueError(f"announcement_wait = {self.announcement_wait}: input should be less than 1 / rate")
         return self
 
@@ -255,7 +255,11 @@ class VehicleNode:
             self.missed_cycles += max(round((cycle - self._cycle) / self._period) - 1, 0)
             self.controller.forget()
         self.reason, self._cycle = "", cycle
-        speed = self.controller.ask()
+        try:
+            speed = self.controller.ask()
+        except ValueError as error:
+            self._stop(str(error))
+            return
         self._spent = time.perf_counter() - start
         self._wait_until = now
         if self.controller.announces:
@@ -272,12 +276,7 @@ class VehicleNode:
         """Publish the command, with the announcements of this cycle that have arrived."""
         start, self._wait_until = time.perf_counter(), math.inf
         announced = {number: speed for number, (cycle, speed) in self._announced.items() if cycle == self._cycle}
-        try:
-            action = self.controller.act(announced)
-        except ValueError as error:
-            self._stop(str(error))
-            return
-        self._command(*action)
+        self._command(*self.controller.act(announced))
         self.decision_times.append(self._spent + time.perf_counter() - start)
 
     def _stop(self, reason: str) -> None:

@@ -142,17 +142,23 @@ class VehicleController:
         """Sense, and ask the policy for an action.
 
         :return: the speed to announce [m/s], that of the action if the vehicles do not announce any
+        :raises ValueError: if the policy's action is not finite
         """
-        positions = np.array([[(body.x, body.y) for body in self.vehicles]])
-        headings = np.array([[body.heading for body in self.vehicles]])
-        obstacles = np.array([(body.x, body.y) for body in self.obstacles]).reshape(1, -1, 2)
-        waypoints, frames = np.array([(self.waypoint.x, self.waypoint.y)]), directions_of(headings)
+        positions, obstacles, waypoints = (
+            np.array([(body.x, body.y) for body in bodies], dtype=np.float64).reshape(1, -1, 2)
+            for bodies in (self.vehicles, self.obstacles, [self.waypoint])
+        )
+        headings = np.array([[body.heading for body in self.vehicles]], dtype=np.float64)
+        frames = directions_of(headings)
         ego_motion = self._ego_motion(positions, headings)
-        truth = sense(positions, frames, obstacles, waypoints, self.scenario, ego_motion)
+        truth = sense(positions, frames, obstacles, waypoints[0], self.scenario, ego_motion)
         sensing = self._sensors.measure(truth)
         observation = observe(sensing, self.scenario)[0, self.vehicle]
         actions = np.zeros_like(positions)
-        actions[0, self.vehicle] = np.clip(self.policy.predict(observation, deterministic=True)[0], *self._bounds)
+        asked = self.policy.predict(observation, deterministic=True)[0]
+        if not np.isfinite(asked).all():
+            raise ValueError(f"the policy's action is not finite: {asked.tolist()}")
+        actions[0, self.vehicle] = np.clip(asked, *self._bounds)
         self._before, self._cycle = (positions, headings), (actions, sensing, frames)
         return float(filter_actions(actions, sensing, self._announcing, frames)[0, self.vehicle, 0])
 
@@ -167,7 +173,6 @@ class VehicleController:
 
         :param announced: speeds that neighbors announced for this cycle [m/s], by number; a missing one counts as 0, which
             costs speed and no separation
-        :raises ValueError: if the policy's action is not finite
         """
         assert self._cycle is not None
         actions, sensing, frames = self._cycle
@@ -175,8 +180,6 @@ class VehicleController:
             if number != self.vehicle and speed > 0:
                 actions[0, number, 0] = min(speed, self.scenario.max_speed)
         speed, turn_rate = filter_actions(actions, sensing, self.scenario, frames)[0, self.vehicle].tolist()
-        if not math.isfinite(speed + turn_rate):
-            raise ValueError(f"the policy's action is {speed} m/s, {turn_rate} rad/s")
         return speed, turn_rate
 
     def forget(self) -> None:
