@@ -154,6 +154,7 @@ commands = st.sampled_from(
         "render no/such -o episode.gif",
         "play no/such",
         "export no/such -o policy.onnx",
+        "ros2 no/such --vehicle 0",
         "compare no/such",
         "enjoy no/such",
         "policies no-such",

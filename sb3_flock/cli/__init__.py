@@ -21,6 +21,7 @@ COMMANDS = {
     "render": "simulate one episode and write a figure, a video or a web page",
     "play": "simulate live in a window, with mouse and keys",
     "export": "write a policy as ONNX or C, for a vehicle's computer",
+    "ros2": "drive one vehicle by a policy, as a node of ROS 2",
     "compare": "show trainings side by side",
     "reproduce": "write the paper's tables and figures with ours",
     "sweep": "train or evaluate at many settings, also on a Ray cluster",

@@ -1,0 +1,205 @@
+"""One vehicle's decisions from the poses of all bodies, by the simulation's own sensing, policy and safety filter."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_flock.evaluation.rollout import as_controller
+from sb3_flock.settings import SettingsError
+from sb3_flock.sim import Scenario, Sensing, observe
+from sb3_flock.sim.dynamics import directions_of, wrap_angle
+from sb3_flock.sim.safety import filter_actions
+from sb3_flock.sim.sensing import sense
+from sb3_flock.sim.sensors import SensorErrors, Sensors
+
+STOP = (0.0, 0.0)
+"""The action of a vehicle that stands still: speed [m/s] and turn rate [rad/s]."""
+
+
+@dataclass
+class Body:
+    """The last pose of a vehicle, an obstacle or the waypoint, in a frame that all bodies share."""
+
+    name: str
+    max_speed: float
+    """How fast it moves at most [m/s]."""
+    x: float = math.nan
+    """[m]"""
+    y: float = math.nan
+    """[m]"""
+    heading: float = math.nan
+    """[rad]"""
+    measured: float = -math.inf
+    """When it was there [s]; minus infinity: never, or what was received last has a fault."""
+    stamp: int = -1
+    """The stamp of its message [ns]."""
+    fault: str = "no pose received"
+    """What is wrong with what was received last; empty if nothing is."""
+
+    def receive(self, x: float, y: float, heading: float, measured: float, stamp: int = 0, fault: str = "") -> None:
+        """Take a pose. One with a fault, or that is not finite, is not used: the body may then be anywhere."""
+        if not fault and not all(map(math.isfinite, (x, y, heading, measured))):
+            fault = "its pose is not finite"
+        self.stamp, self.fault = stamp, fault
+        if fault:
+            self.measured = -math.inf
+        else:
+            self.x, self.y, self.heading, self.measured = x, y, heading, measured
+
+    def age(self, now: float) -> float:
+        """Time since the pose was measured [s]; infinite where there is none, or if the clock was set back."""
+        return now - self.measured if now >= self.measured else math.inf
+
+
+class VehicleController:
+    """What one vehicle of a flock does: poses in, speed and turn rate out.
+
+    Everything is computed as the world and an evaluation compute it for this vehicle. Its sensors are exact: errors are those of
+    the poses. The vehicle's ego-motion is taken from its own poses.
+
+    A cycle is :meth:`reason_to_stop`, :meth:`ask`, and :meth:`act`. All times are those of one clock that never goes back [s].
+
+    :param policy: a loaded policy, or anything with SB3's ``predict``
+    :param scenario: the task, with the numbers of vehicles and obstacles, and the safety filter
+    :param vehicle: the number of the vehicle, from 0
+    :param timeout: age from which a pose is lost [s]
+    :raises SettingsError: if there is no such vehicle
+    :raises PolicyError: if a loaded policy's observations differ in shape; it warns where they have another meaning
+    """
+
+    def __init__(self, policy: Any, scenario: Scenario, vehicle: int, timeout: float) -> None:
+        if not 0 <= vehicle < scenario.n_vehicles:
+            raise SettingsError(f"vehicle = {vehicle}: input should be from 0 to n_vehicles - 1 = {scenario.n_vehicles - 1}")
+        as_controller(policy, scenario)  # checks the policy
+        self.policy, self.vehicle, self.timeout = policy, vehicle, timeout
+        self.scenario = scenario.replace(sensors=SensorErrors())
+        self.vehicles = [Body(f"vehicle {number}", scenario.max_speed) for number in range(scenario.n_vehicles)]
+        self.obstacles = [Body(f"obstacle {number}", scenario.obstacle_max_speed) for number in range(scenario.n_obstacles)]
+        self.waypoint = Body("the waypoint", scenario.waypoint_speed)
+        self._announcing = self.scenario.replace(safety_filter="heading") if self.announces else self.scenario
+        self._sensors = Sensors(self.scenario)
+        self._bounds = (0.0, -scenario.max_turn_rate), (scenario.max_speed, scenario.max_turn_rate)
+        self._before: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
+        self._cycle: tuple[NDArray[np.float64], Sensing, NDArray[np.float64]] | None = None
+
+    @property
+    def own(self) -> Body:
+        """The vehicle itself."""
+        return self.vehicles[self.vehicle]
+
+    @property
+    def bodies(self) -> list[Body]:
+        """All bodies and the waypoint."""
+        return [*self.vehicles, *self.obstacles, self.waypoint]
+
+    @property
+    def announces(self) -> bool:
+        """Whether the vehicles announce speeds to each other."""
+        return self.scenario.safety_filter == "announce"
+
+    def warm_up(self) -> None:
+        """Decide twice for made-up poses, so that no later decision waits for a compiler; call it before the first pose."""
+        for number, body in enumerate(self.bodies):
+            body.receive(0.9 * number * self.scenario.link_range, 0.0, 0.0, 0.0)
+        for _ in range(2):
+            self.ask()
+            self.act()
+        self.forget()
+        for body in self.bodies:
+            body.receive(0.0, 0.0, 0.0, 0.0, stamp=-1, fault=Body.fault)
+
+    def reason_to_stop(self, now: float) -> str:
+        """Why the vehicle may not move; empty if it may.
+
+        Its own pose and the waypoint must not be lost. A neighbor or an obstacle that is lost is a reason if it may be in
+        range by now: at its top speed from where it was last. Otherwise its last position is used, which is out of range.
+        """
+        for body in (self.own, self.waypoint):
+            if body.age(now) > self.timeout:
+                return self._describe(body)
+        scenario = self.scenario
+        near = [(body, scenario.link_range) for body in self.vehicles if body is not self.own]
+        near += [(body, scenario.known_obstacle_range) for body in self.obstacles]
+        for body, reach in near:
+            age = body.age(now)
+            if age > self.timeout:
+                distance = math.hypot(body.x - self.own.x, body.y - self.own.y)
+                if math.isinf(age) or distance - age * body.max_speed < reach:
+                    return self._describe(body)
+        return ""
+
+    def next_loss(self, now: float) -> float:
+        """When the first pose that is not lost is lost if nothing is received; infinite without one [s]."""
+        return min((body.measured + self.timeout for body in self.bodies if body.age(now) <= self.timeout), default=math.inf)
+
+    def ask(self) -> float:
+        """Sense, and ask the policy for an action.
+
+        :return: the speed to announce [m/s], that of the action if the vehicles do not announce any
+        :raises ValueError: if the policy's action is not finite
+        """
+        positions, obstacles, waypoints = (
+            np.array([(body.x, body.y) for body in bodies], dtype=np.float64).reshape(1, -1, 2)
+            for bodies in (self.vehicles, self.obstacles, [self.waypoint])
+        )
+        headings = np.array([[body.heading for body in self.vehicles]], dtype=np.float64)
+        frames = directions_of(headings)
+        ego_motion = self._ego_motion(positions, headings)
+        truth = sense(positions, frames, obstacles, waypoints[0], self.scenario, ego_motion)
+        sensing = self._sensors.measure(truth)
+        observation = observe(sensing, self.scenario)[0, self.vehicle]
+        actions = np.zeros_like(positions)
+        asked = self.policy.predict(observation, deterministic=True)[0]
+        if not np.isfinite(asked).all():
+            raise ValueError(f"the policy's action is not finite: {asked.tolist()}")
+        actions[0, self.vehicle] = np.clip(asked, *self._bounds)
+        self._before, self._cycle = (positions, headings), (actions, sensing, frames)
+        return float(filter_actions(actions, sensing, self._announcing, frames)[0, self.vehicle, 0])
+
+    def neighbors(self) -> list[int]:
+        """The vehicles that were in range at the last :meth:`ask`."""
+        assert self._cycle is not None
+        found: list[int] = self._cycle[1].neighbors.by_observer()[self.vehicle].tolist()
+        return found
+
+    def act(self, announced: Mapping[int, float] | None = None) -> tuple[float, float]:
+        """The action to hold for one period, after :meth:`ask`: speed [m/s] and turn rate [rad/s], filtered.
+
+        :param announced: speeds that neighbors announced for this cycle [m/s], by number; a missing one counts as 0, which
+            costs speed and no separation
+        """
+        assert self._cycle is not None
+        actions, sensing, frames = self._cycle
+        for number, speed in (announced or {}).items():
+            if number != self.vehicle and speed > 0:
+                actions[0, number, 0] = min(speed, self.scenario.max_speed)
+        speed, turn_rate = filter_actions(actions, sensing, self.scenario, frames)[0, self.vehicle].tolist()
+        return speed, turn_rate
+
+    def forget(self) -> None:
+        """Start anew after a stop or a missed cycle: earlier measurements are not used any more."""
+        self._sensors.forget()
+        self._before = self._cycle = None
+
+    def _ego_motion(self, positions: NDArray[np.float64], headings: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """The vehicles' motion since the last cycle, forward and turn; motion across the heading is left out."""
+        if self._before is None:
+            return None
+        before, earlier = self._before
+        forward = ((positions - before) * directions_of(earlier)).sum(-1)
+        return np.stack((forward, wrap_angle(headings - earlier)), axis=-1)
+
+    def _describe(self, body: Body) -> str:
+        return f"{body.name}: {body.fault or f'no pose for {self.timeout} s'}"
+
+
+def heading_of(x: float, y: float, z: float, w: float) -> float:
+    """The heading of a quaternion of any length but 0, its yaw [rad]; NaN for 0."""
+    sin, cos = 2.0 * (w * z + x * y), w * w + x * x - y * y - z * z
+    return math.atan2(sin, cos) if sin or cos else math.nan
