@@ -41,10 +41,12 @@ class CompactReplayBuffer(ReplayBuffer):
     :param buffer_size: capacity [transitions]
     :param observation_space: a ``Box`` of floats
     :param mirror_augmentation: mirror half of every sample, left for right: the task is symmetric, so a mirrored transition
-        is as valid as the original
+        is as valid as the original. The last axis of the observations ``(channels, l, l)`` is reversed, and the second action,
+        the turn rate, changes its sign
     :param store_expert_actions: also store each info's ``expert_action`` ``(2,)`` [m/s, rad/s], see
         :class:`~sb3_flock.envs.expert_env.ExpertEnv`; samples are then :class:`ExpertReplayBufferSamples`
-    :raises SettingsError: if an added transition has no ``expert_action`` although they are to be stored
+    :raises SettingsError: for ``mirror_augmentation`` with other observations or actions; if an added transition has no
+        ``expert_action`` although they are to be stored
 
     The other parameters are those of SB3's ``ReplayBuffer``.
     """
@@ -73,6 +75,8 @@ class CompactReplayBuffer(ReplayBuffer):
             store_expert_actions = options.pop("store_expert_actions", store_expert_actions)
             if options:
                 raise TypeError(f"CompactReplayBuffer got an unexpected argument {next(iter(options))!r}")
+        if mirror_augmentation:
+            _check_mirror(observation_space, action_space)
         half = spaces.Box(-1.0, 1.0, observation_space.shape, np.float16)  # only its shape and type count
         # One row more than asked for: the row after the newest holds its next observation, and is not sampled.
         super().__init__(
@@ -183,6 +187,19 @@ class CompactReplayBuffer(ReplayBuffer):
 
     def _to_float(self, observations: Any) -> th.Tensor:
         return self.to_torch(observations, copy=False).float()
+
+
+def _check_mirror(observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
+    shape = observation_space.shape or ()
+    is_map = len(shape) == 3 and shape[1] == shape[2]
+    turns = (
+        isinstance(action_space, spaces.Box) and action_space.shape == (2,) and action_space.low[1] == -action_space.high[1]
+    )
+    if not (is_map and turns):
+        raise SettingsError(
+            f"mirror_augmentation = True: observations of shape (channels, l, l), and actions of a speed and a turn rate within "
+            f"[-w, w] are needed, not {observation_space} and {action_space}"
+        )
 
 
 def replay_state(buffer: ReplayBuffer) -> dict[str, Any]:

@@ -30,7 +30,8 @@ class FlockCNN(BaseFeaturesExtractor):
     :param stride: stride of the convolutions
     :param layer_norm: layer norm on the dense layer's output before its ReLU (the paper has none); without it this task is
         not learned
-    :raises SettingsError: if the convolutions do not fit the observation
+    :raises SettingsError: if the observation has another shape, such as one with the channels last or stacked along the last
+        axis (``VecFrameStack`` without ``channels_order="first"``), or the convolutions do not fit it
     """
 
     def __init__(
@@ -42,11 +43,14 @@ class FlockCNN(BaseFeaturesExtractor):
         stride: int = 2,
         layer_norm: bool = True,
     ) -> None:
-        if len(observation_space.shape) != 3:
-            raise SettingsError(f"FlockCNN needs observations of shape (channels, l, l), not {observation_space.shape}")
+        shape = observation_space.shape
+        if shape is None or len(shape) != 3 or shape[1] != shape[2]:
+            raise SettingsError(
+                f"FlockCNN needs observations of shape (channels, l, l), not {shape}"
+                + ("; VecFrameStack needs channels_order='first'" if shape is not None and len(shape) == 3 else "")
+            )
         super().__init__(observation_space, features_dim)
-        in_channels, side, _ = observation_space.shape
-        self.input_shape: tuple[int, int, int] = observation_space.shape
+        in_channels, side, _ = self.input_shape = shape
         layers: list[nn.Module] = []
         for layer, out_channels in enumerate(channels):
             if kernel_size > side:

@@ -84,6 +84,25 @@ def test_mirror_augmentation_mirrors_half_of_a_sample_left_for_right():
     th.testing.assert_close(batch.rewards, expected.rewards, rtol=0, atol=0)
 
 
+@pytest.mark.parametrize(
+    ("observations", "actions"),
+    [
+        (spaces.Box(0, 1, (8,)), SPACES[1]),
+        (spaces.Box(0, 1, (3, 11, 44)), SPACES[1]),
+        (SPACES[0], spaces.Box(-1, 1, (3,))),
+        (SPACES[0], spaces.Box(0, 1, (2,))),
+        (SPACES[0], spaces.Discrete(3)),
+    ],
+)
+def test_what_has_no_left_and_right_is_not_mirrored(observations, actions):
+    with pytest.raises(
+        SettingsError, match=r"^mirror_augmentation = True: observations of shape \(channels, l, l\)"
+    ) as error:
+        CompactReplayBuffer(80, observations, actions, device="cpu", mirror_augmentation=True)
+    assert "\n" not in str(error.value)
+    CompactReplayBuffer(80, observations, actions, device="cpu")
+
+
 @pytest.mark.parametrize("mirror_augmentation", [False, True])
 def test_expert_actions_are_scaled_and_mirrored_with_their_transition(mirror_augmentation):
     options = {"mirror_augmentation": mirror_augmentation, "store_expert_actions": True}

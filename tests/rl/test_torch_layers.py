@@ -3,8 +3,10 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import DDPG
+from stable_baselines3.common.vec_env import VecFrameStack
 
 from sb3_flock import FlockCNN, make_vec_env
+from sb3_flock.settings import SettingsError
 
 
 def space(side=11, channels=3):
@@ -53,8 +55,23 @@ def test_every_anchor_has_a_gradient():
 def test_an_observation_too_small_or_of_another_kind_is_refused():
     with pytest.raises(ValueError, match="do not fit an observation of"):
         FlockCNN(space(3))
-    with pytest.raises(ValueError, match="channels, l, l"):
+    with pytest.raises(SettingsError, match=r"^FlockCNN needs observations of shape \(channels, l, l\), not \(5,\)$"):
         FlockCNN(spaces.Box(0.0, 1.0, (5,), np.float32))
+    for shape in ((11, 11, 3), (3, 11, 44), (3, 44, 11)):
+        with pytest.raises(SettingsError, match=r"not \(\d+, \d+, \d+\); VecFrameStack needs channels_order='first'$"):
+            FlockCNN(spaces.Box(0.0, 1.0, shape, np.float32))
+
+
+def test_stacked_frames_are_refused_or_seen_whole():
+    kwargs = {"policy_kwargs": {"features_extractor_class": FlockCNN}, "buffer_size": 10, "device": "cpu"}
+    with pytest.raises(SettingsError, match=r"not \(3, 11, 44\); VecFrameStack needs channels_order='first'"):
+        DDPG("MlpPolicy", VecFrameStack(make_vec_env(n_flocks=1, seed=0), 4), **kwargs)
+    env = VecFrameStack(make_vec_env(n_flocks=1, seed=0), 4, channels_order="first")
+    extractor = DDPG("MlpPolicy", env, **kwargs).actor.features_extractor
+    observation = th.from_numpy(env.reset()).requires_grad_()
+    extractor(observation).sum().backward()
+    assert observation.shape == (3, 12, 11, 11)
+    assert (observation.grad != 0).any(dim=(0, 2, 3)).all()
 
 
 def test_the_extractor_in_plain_sb3():
