@@ -43,7 +43,7 @@ class NeighborInclusiveReward(BaseCallback):
     :param n_agents: agents in one copy of the env; needed only on vector envs that :func:`sb3_flock.flatten` did not make
     :param verbose: SB3's verbosity
     :raises SettingsError: for a share outside [0, 1]; at the start of the training, if the agents cannot be counted or an
-        off-policy algorithm's env is wrapped in ``VecNormalize``
+        off-policy algorithm's env is wrapped in ``VecNormalize``, or if it is listed twice
     """
 
     def __init__(self, lambda_: float = 0.7, n_agents: int | None = None, verbose: int = 0) -> None:
@@ -74,6 +74,12 @@ class NeighborInclusiveReward(BaseCallback):
             )
         self._agents_per_copy = n_agents
         self._returns = np.zeros(n_envs)
+
+    def _on_training_start(self) -> None:
+        if _count(self.locals.get("callback"), NeighborInclusiveReward) > 1:
+            raise SettingsError(
+                "NeighborInclusiveReward is among the callbacks more than once: it would mix the rewards again"
+            )
 
     def _on_step(self) -> bool:
         rewards, infos = self.locals["rewards"], self.locals["infos"]
@@ -107,6 +113,12 @@ class NeighborInclusiveReward(BaseCallback):
         found = first + np.concatenate(neighbors).astype(np.int64)
         acted = _alive(infos)[found]
         return mix_rewards(rewards, observers[acted], found[acted], self.lambda_)
+
+
+def _count(callback: Any, kind: type[BaseCallback]) -> int:
+    """How often a kind of callback is in a callback, at any depth of SB3's lists and events."""
+    below = [*getattr(callback, "callbacks", ()), getattr(callback, "callback", None)]
+    return isinstance(callback, kind) + sum(_count(one, kind) for one in below if one is not None)
 
 
 class StoreExecutedActions(BaseCallback):

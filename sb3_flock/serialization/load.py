@@ -238,7 +238,7 @@ def _rebuild(config: TrainingConfig, weights: Mapping[str, Any], actor_only: boo
     needed = fewest_parameters(config, config.scenario.observation_shape)
     if needed > stored:
         raise ValueError(f"policy.pth holds {stored} numbers, the networks at least {needed}")
-    policy = _build_policy(config)
+    policy = build_policy(config)
     part: nn.Module = policy
     if actor_only:
         part = policy.get_submodule("actor")
@@ -254,7 +254,8 @@ class _NoOptimizer:
         """Takes what an optimizer takes."""
 
 
-def _build_policy(config: TrainingConfig) -> BasePolicy:
+def build_policy(config: TrainingConfig) -> BasePolicy:
+    """The untrained policy of a config, for inference: without optimizers."""
     _, policy_class = ALGORITHMS[config.algo].load()
     policy = policy_class(
         observation_space(config.scenario),
