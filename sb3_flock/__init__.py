@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from sb3_flock.envs import flocking_v0
     from sb3_flock.envs.expert_env import ExpertEnv
     from sb3_flock.envs.vec_env import flatten, make_vec_env
+    from sb3_flock.envs.vec_reward import VecNeighborInclusiveReward
     from sb3_flock.evaluation import evaluate, register_metric
     from sb3_flock.rl.buffers import CompactReplayBuffer
     from sb3_flock.rl.callbacks import DropDeadTransitions, NeighborInclusiveReward
@@ -50,6 +51,7 @@ __all__ = [
     "RewardWeights",
     "Scenario",
     "TrainingConfig",
+    "VecNeighborInclusiveReward",
     "World",
     "evaluate",
     "export",
@@ -85,6 +87,7 @@ _HOMES = {
     "RewardWeights": "sim",
     "Scenario": "sim",
     "TrainingConfig": "config.training",
+    "VecNeighborInclusiveReward": "envs.vec_reward",
     "World": "sim",
     "evaluate": "evaluation",
     "export": "deploy.onnx_export",

@@ -17,6 +17,10 @@ class RunError(RuntimeError):
     """A run failed for a reason outside its parameters: a full disk, a dead worker, a diverged training."""
 
 
+class ActionError(UserError):
+    """Actions are not finite or have another shape than they need."""
+
+
 class SettingsError(UserError):
     """A parameter has a value that is not accepted.
 

@@ -16,9 +16,10 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
 
 from sb3_flock._renamed import rename_fields, rename_key, warn_renamed
-from sb3_flock.errors import RunError, SettingsError, UserError
+from sb3_flock.errors import ActionError, RunError, SettingsError, UserError
 
 __all__ = [
+    "ActionError",
     "Coordinate",
     "NotNegative",
     "Positive",

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.random import Generator
 from numpy.typing import NDArray
 
 from sb3_flock.controllers.base import Controller
+from sb3_flock.settings import ActionError
 from sb3_flock.sim import Scenario, Sensing, observe
 
 _BLOCK = 256
@@ -18,22 +21,51 @@ only, a vehicle's action does not depend on how many others are computed with it
 class PolicyController(Controller):
     """Drives by anything with SB3's ``predict(observations, deterministic=...)``: a model, its policy or a loaded policy.
 
+    ``predict`` of a recurrent policy (sb3-contrib's RecurrentPPO) returns its state, and is given ``state`` and
+    ``episode_start``, too.
+
     :param policy: the policy; one row of its input is one vehicle's observation. For a model whose env is wrapped in
         ``VecNormalize`` the observations are normalized by it
     """
 
     def __init__(self, policy: Any) -> None:
         self.policy = policy
+        self._states: list[Any] = []
+
+    def reset(self, rngs: Sequence[Generator], scenario: Scenario) -> None:
+        """Start episodes: a recurrent policy starts from its initial state."""
+        self._states = []
 
     def act(self, sensing: Sensing, scenario: Scenario) -> NDArray[np.floating]:
-        """Deterministic actions ``(flocks, vehicles, 2)`` [m/s, rad/s] from the observations."""
+        """Deterministic actions ``(flocks, vehicles, 2)`` [m/s, rad/s] from the observations.
+
+        A state that ``predict`` returns is given to its next call, until the next :meth:`reset`.
+
+        :raises ActionError: if ``predict`` gives actions of another shape
+        """
         observations = observe(sensing, scenario)
         rows = observations.reshape(-1, *scenario.observation_shape)
         padded = np.zeros((-(-len(rows) // _BLOCK) * _BLOCK, *rows.shape[1:]), dtype=rows.dtype)
         vec_normalize = getattr(self.policy, "get_vec_normalize_env", lambda: None)()
         padded[: len(rows)] = rows if vec_normalize is None else vec_normalize.normalize_obs(rows)
-        actions = [
-            self.policy.predict(padded[start : start + _BLOCK], deterministic=True)[0]
-            for start in range(0, len(padded), _BLOCK)
-        ]
-        return np.concatenate(actions)[: len(rows)].reshape(*observations.shape[:2], 2)
+        blocks = padded.reshape(-1, _BLOCK, *rows.shape[1:])
+        memories = self._states if len(self._states) == len(blocks) else [None] * len(blocks)
+        results = [self._predict(block, state) for block, state in zip(blocks, memories, strict=True)]
+        self._states = [state for _, state in results if state is not None]
+        return np.concatenate([actions for actions, _ in results])[: len(rows)].reshape(*observations.shape[:2], 2)
+
+    def _predict(self, block: NDArray[np.float32], state: Any) -> tuple[NDArray[np.floating], Any]:
+        """The actions of a block, ``(rows, 2)``, and a recurrent policy's state after it."""
+        memory = {} if state is None else {"state": state, "episode_start": np.zeros(len(block), bool)}
+        actions, state = self.policy.predict(block, deterministic=True, **memory)
+        if np.shape(actions) != (len(block), 2):
+            raise ActionError(f"predict gives actions of the shape {np.shape(actions)}: {(len(block), 2)} is needed")
+        return actions, state
+
+    def state_dict(self) -> dict[str, Any]:
+        """The states of a recurrent policy."""
+        return {"states": self._states} if self._states else {}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore :meth:`state_dict`."""
+        self._states = list(state.get("states", ()))

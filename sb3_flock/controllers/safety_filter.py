@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sb3_flock.controllers.base import Controller
 from sb3_flock.controllers.policy import PolicyController
 from sb3_flock.settings import SettingsError
-from sb3_flock.sim import Scenario, Sensing
+from sb3_flock.sim import Scenario, Sensing, check_actions
 from sb3_flock.sim.safety import filter_actions
 
 _LEVELS = ("voronoi", "motion")
@@ -57,10 +57,14 @@ class SafetyFilter(Controller):
         self.controller.reset(rngs, scenario)
 
     def act(self, sensing: Sensing, scenario: Scenario) -> NDArray[np.float64]:
-        """The controller's actions ``(flocks, vehicles, 2)`` [m/s, rad/s], clipped and filtered."""
+        """The controller's actions ``(flocks, vehicles, 2)`` [m/s, rad/s], clipped and filtered.
+
+        :raises ActionError: if the controller's actions have another shape, or are not finite
+        """
+        given = np.asarray(self.controller.act(sensing, scenario), dtype=np.float64)
+        check_actions(given, (*sensing.waypoint_distances.shape, 2), "flock", "vehicle")
         low, high = (0.0, -scenario.max_turn_rate), (scenario.max_speed, scenario.max_turn_rate)
-        actions = np.clip(np.asarray(self.controller.act(sensing, scenario), dtype=np.float64), low, high)
-        return filter_actions(actions, sensing, self._filtered(scenario))
+        return filter_actions(np.clip(given, low, high), sensing, self._filtered(scenario))
 
     def state_dict(self) -> dict[str, Any]:
         """The memory of the controller."""

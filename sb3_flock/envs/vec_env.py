@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 import supersuit
+from gymnasium import spaces
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 from stable_baselines3.common.monitor import Monitor
@@ -33,7 +34,7 @@ from sb3_flock.envs.flat_env import RESET_INFO, FlatEnv
 from sb3_flock.envs.multi_flock import MultiFlockEnv
 from sb3_flock.envs.wrappers import check_parallel_env, layers_of, owner_of, without_black_death
 from sb3_flock.settings import RunError, SettingsError, check_integer
-from sb3_flock.sim import Scenario
+from sb3_flock.sim import Scenario, check_actions
 
 
 def make_vec_env(
@@ -193,7 +194,12 @@ class ParameterSharingVecEnv(SB3VecEnvWrapper):
     # -- stepping ----------------------------------------------------------------------------------------------------
 
     def step_async(self, actions: NDArray[Any]) -> None:
-        """Send one action to each slot."""
+        """Send one action to each slot.
+
+        :raises ActionError: for actions of another shape, or that are not finite
+        """
+        if isinstance(self.action_space, spaces.Box):
+            check_actions(np.asarray(actions), (self.num_envs, *self.action_space.shape), "slot")
         with self._guarded():
             self.venv.step_async(actions)
 

@@ -12,14 +12,14 @@ from stable_baselines3.common.buffers import ReplayBuffer, RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import VecNormalize, unwrap_vec_wrapper
 
 from sb3_flock._compat import progress_remaining, set_noise_std
 from sb3_flock._renamed import renamed_member
+from sb3_flock.envs.vec_reward import VecNeighborInclusiveReward, check_share, count_agents, mix_by_infos
 from sb3_flock.rl.alive_buffers import AliveReplayBuffer, AliveRolloutBuffer
 from sb3_flock.rl.buffers import CompactReplayBuffer
 from sb3_flock.settings import RunError, SettingsError
-from sb3_flock.sim import mix_rewards
 
 
 class NeighborInclusiveReward(BaseCallback):
@@ -37,19 +37,19 @@ class NeighborInclusiveReward(BaseCallback):
     With ``VecNormalize``, on policy (PPO, A2C) the rewards are mixed before they are normalized: the buffer stores the mixed
     reward divided by the standard deviation of the raw rewards' discounted returns, and clipped, which is what ``VecNormalize``
     computes. Off policy (DDPG, TD3, SAC) it is refused, also with ``norm_reward=False``: SB3 takes the rewards that the replay
-    buffer stores from ``VecNormalize``, below which no callback reaches.
+    buffer stores from ``VecNormalize``, below which no callback reaches. There
+    :class:`~sb3_flock.envs.vec_reward.VecNeighborInclusiveReward` mixes them, below ``VecNormalize``.
 
     :param lambda_: share of a vehicle's own reward, in [0, 1]
     :param n_agents: agents in one copy of the env; needed only on vector envs that :func:`sb3_flock.flatten` did not make
     :param verbose: SB3's verbosity
     :raises SettingsError: for a share outside [0, 1]; at the start of the training, if the agents cannot be counted or an
-        off-policy algorithm's env is wrapped in ``VecNormalize``
+        off-policy algorithm's env is wrapped in ``VecNormalize``, or if the rewards would be mixed twice
     """
 
     def __init__(self, lambda_: float = 0.7, n_agents: int | None = None, verbose: int = 0) -> None:
         super().__init__(verbose)
-        if not 0 <= lambda_ <= 1:
-            raise SettingsError(f"lambda_ = {lambda_}: input should be between 0 and 1")
+        check_share(lambda_)
         self.lambda_ = lambda_
         self.n_agents = n_agents
         self._agents_per_copy = n_agents or 1
@@ -62,18 +62,18 @@ class NeighborInclusiveReward(BaseCallback):
         if self._vec_normalize is not None and isinstance(self.model, OffPolicyAlgorithm):
             raise SettingsError(
                 f"VecNormalize is not accepted with {type(self.model).__name__}: the replay buffer would store its rewards and "
-                "not the neighbor-inclusive ones"
+                "not the neighbor-inclusive ones; a VecNeighborInclusiveReward below VecNormalize mixes them before"
             )
-        n_envs = self.training_env.num_envs
-        counted = getattr(self.training_env, "n_agents", None)
-        n_agents = self.n_agents or counted
-        if n_agents is None or n_envs % n_agents or n_agents != (counted or n_agents):
+        if unwrap_vec_wrapper(self.training_env, VecNeighborInclusiveReward) is not None:
+            raise SettingsError("NeighborInclusiveReward: the env's VecNeighborInclusiveReward mixes the rewards already")
+        self._agents_per_copy = count_agents(self.training_env, self.n_agents)
+        self._returns = np.zeros(self.training_env.num_envs)
+
+    def _on_training_start(self) -> None:
+        if _count(self.locals.get("callback"), NeighborInclusiveReward) > 1:
             raise SettingsError(
-                f"n_agents = {n_agents}: the number of agents in one copy of the env is needed, "
-                + (f"which is {counted}" if counted else f"a divisor of {n_envs}")
+                "NeighborInclusiveReward is among the callbacks more than once: it would mix the rewards again"
             )
-        self._agents_per_copy = n_agents
-        self._returns = np.zeros(n_envs)
 
     def _on_step(self) -> bool:
         rewards, infos = self.locals["rewards"], self.locals["infos"]
@@ -101,12 +101,13 @@ class NeighborInclusiveReward(BaseCallback):
 
     def mix(self, rewards: np.ndarray, infos: list[dict[str, Any]]) -> np.ndarray:
         """The mixed reward of every slot of the vector env, ``(slots,)``."""
-        neighbors = [info.get("neighbors", ()) for info in infos]
-        observers = np.repeat(np.arange(len(infos)), [len(found) for found in neighbors])
-        first = observers - observers % self._agents_per_copy  # slot of the copy's first agent
-        found = first + np.concatenate(neighbors).astype(np.int64)
-        acted = _alive(infos)[found]
-        return mix_rewards(rewards, observers[acted], found[acted], self.lambda_)
+        return mix_by_infos(rewards, infos, self._agents_per_copy, self.lambda_)
+
+
+def _count(callback: Any, kind: type[BaseCallback]) -> int:
+    """How often a kind of callback is in a callback, at any depth of SB3's lists and events."""
+    below = [*getattr(callback, "callbacks", ()), getattr(callback, "callback", None)]
+    return isinstance(callback, kind) + sum(_count(one, kind) for one in below if one is not None)
 
 
 class StoreExecutedActions(BaseCallback):

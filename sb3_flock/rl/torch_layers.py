@@ -50,8 +50,7 @@ class FlockCNN(BaseFeaturesExtractor):
                 + ("; VecFrameStack needs channels_order='first'" if shape is not None and len(shape) == 3 else "")
             )
         super().__init__(observation_space, features_dim)
-        in_channels, side, _ = observation_space.shape
-        self.input_shape: tuple[int, int, int] = observation_space.shape
+        in_channels, side, _ = self.input_shape = shape
         layers: list[nn.Module] = []
         for layer, out_channels in enumerate(channels):
             if kernel_size > side:

@@ -31,7 +31,7 @@ from sb3_flock.rl.ddpg import FlockDDPG
 from sb3_flock.rl.registry import ALGORITHMS, fewest_parameters, policy_kwargs
 from sb3_flock.serialization.migrate import FORMAT, MEMBER, check_format, migrate_config, migrate_weights
 from sb3_flock.settings import SettingsError, UserError
-from sb3_flock.sim import Scenario
+from sb3_flock.sim import Scenario, check_actions
 
 _CHECKPOINT = re.compile(r"rl_model_(\d+)_steps\.zip")
 
@@ -94,8 +94,13 @@ class LoadedPolicy:
     def predict(
         self, observation: np.ndarray, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> tuple[np.ndarray, Any]:
-        """SB3's ``predict``: observations ``(vehicles, channels, l, l)`` (or one) to actions ``(vehicles, 2)`` [m/s, rad/s]."""
-        return self.policy.predict(observation, state, episode_start, deterministic)
+        """SB3's ``predict``: observations ``(vehicles, channels, l, l)`` (or one) to actions ``(vehicles, 2)`` [m/s, rad/s].
+
+        :raises ActionError: if an action is not finite
+        """
+        actions, state = self.policy.predict(observation, state, episode_start, deterministic)
+        check_actions(actions, actions.shape, *["vehicle"] * (actions.ndim - 1))
+        return actions, state
 
 
 def check_device(device: str) -> None:
@@ -233,7 +238,7 @@ def _rebuild(config: TrainingConfig, weights: Mapping[str, Any], actor_only: boo
     needed = fewest_parameters(config, config.scenario.observation_shape)
     if needed > stored:
         raise ValueError(f"policy.pth holds {stored} numbers, the networks at least {needed}")
-    policy = _build_policy(config)
+    policy = build_policy(config)
     part: nn.Module = policy
     if actor_only:
         part = policy.get_submodule("actor")
@@ -249,7 +254,8 @@ class _NoOptimizer:
         """Takes what an optimizer takes."""
 
 
-def _build_policy(config: TrainingConfig) -> BasePolicy:
+def build_policy(config: TrainingConfig) -> BasePolicy:
+    """The untrained policy of a config, for inference: without optimizers."""
     _, policy_class = ALGORITHMS[config.algo].load()
     policy = policy_class(
         observation_space(config.scenario),

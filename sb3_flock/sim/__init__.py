@@ -7,7 +7,7 @@ from sb3_flock.sim.observation import Channel, observe, register_channel
 from sb3_flock.sim.reward import RewardWeights, mix_rewards, own_reward, register_reward_term, reward_terms
 from sb3_flock.sim.scenario import Scenario
 from sb3_flock.sim.sensing import Contacts, Sensing
-from sb3_flock.sim.world import World, episode_rng
+from sb3_flock.sim.world import World, check_actions, episode_rng
 
 __all__ = [
     "Channel",
@@ -16,6 +16,7 @@ __all__ = [
     "Scenario",
     "Sensing",
     "World",
+    "check_actions",
     "episode_rng",
     "mix_rewards",
     "observe",

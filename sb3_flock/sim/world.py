@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from pydantic import Field, model_validator
 
-from sb3_flock.settings import Coordinate, NotNegative, Positive, UserError
+from sb3_flock.settings import ActionError, Coordinate, NotNegative, Positive, UserError
 from sb3_flock.sim import dynamics
 from sb3_flock.sim.backend import compiled
 from sb3_flock.sim.dynamics import directions_of
@@ -84,6 +84,20 @@ _EPISODE = (
 
 class WorldError(UserError):
     """The scenario leaves no room to start."""
+
+
+def check_actions(actions: NDArray[Any], shape: tuple[int, ...], *owners: str) -> None:
+    """Check that actions have a shape and are finite: one that is NaN would violate no separation.
+
+    :param owners: what the leading axes count, such as ``"flock", "vehicle"``
+    :raises ActionError: if they have not, or are not
+    """
+    if actions.shape != shape:
+        raise ActionError(f"actions have the shape {actions.shape}: {shape} is needed")
+    if not np.isfinite(actions).all():
+        place = np.argwhere(~np.isfinite(actions))[0].tolist()[: len(owners)]
+        whose = " ".join(f"{owner} {index}" for owner, index in zip(owners, place, strict=True))
+        raise ActionError(f"action{whose and f' of {whose}'} = {actions[tuple(place)].tolist()}: finite numbers are needed")
 
 
 def episode_rng(seed: int, episode: int) -> Generator:
@@ -189,13 +203,16 @@ class World:
 
         :param actions: ``(flocks, vehicles, 2)``, speed v [m/s] and turn rate omega [rad/s], clipped to their bounds
         :return: what the vehicles sense afterwards, and the executed actions: clipped, and filtered where the scenario says so
+        :raises ActionError: for actions of another shape, or that are not finite
         :raises RuntimeError: before a reset or after the episode's last step
         """
         safety = self.safety
         if self.steps >= self.scenario.max_cycles:
             raise RuntimeError("no episode is running: call reset() first")
         low, high = self._bounds
-        executed = np.minimum(np.maximum(np.asarray(actions, dtype=np.float64), low), high)
+        given = np.asarray(actions, dtype=np.float64)
+        check_actions(given, low.shape, "flock", "vehicle")
+        executed = np.minimum(np.maximum(given, low), high)
         if safety.is_filtered:
             executed = filter_actions(executed, self.sensors.latest or self.sense(), safety, self.frames)
         self.sensors.latest = None

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from sb3_contrib import RecurrentPPO
 from stable_baselines3 import DDPG
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -7,6 +8,7 @@ from sb3_flock import FlockPolicy, Scenario, make_vec_env
 from sb3_flock.controllers.policy import PolicyController
 from sb3_flock.envs.flocking_v0 import action_space, observation_space
 from sb3_flock.sim import World, episode_rng, observe
+from tests.helpers import place
 
 SCENARIO = Scenario(n_vehicles=5, n_obstacles=2, max_cycles=40, arena=0.5, obstacle_arena=0.5)
 
@@ -53,6 +55,44 @@ def test_predict_is_called_with_blocks_of_one_shape_deterministically(n_flocks, 
     actions = PolicyController(policy).act(sensing, SCENARIO)
     assert policy.calls == [((256, 3, 11, 11), True)] * calls
     np.testing.assert_array_equal(actions, observe(sensing, SCENARIO)[..., [0, 2], 5, 5])
+
+
+class Counts:
+    """A recurrent policy: its action is the number of the row's steps, in hundredths."""
+
+    def predict(self, observations, state=None, episode_start=None, deterministic=False):
+        steps = np.zeros((1, len(observations))) if state is None else np.where(episode_start, 0, state)
+        return np.repeat(steps.T / 100, 2, axis=1), steps + 1
+
+
+def test_a_recurrent_policy_keeps_its_state_within_an_episode_and_in_checkpoints():
+    controller, sensing = PolicyController(Counts()), sensed(60)  # 300 rows: two blocks
+    for _ in range(2):
+        controller.reset([], SCENARIO)
+        for step in range(3):
+            assert (controller.act(sensing, SCENARIO) == step / 100).all()
+    other = PolicyController(Counts())
+    other.load_state_dict(controller.state_dict())
+    assert (other.act(sensing, SCENARIO) == 0.03).all()
+    assert (controller.act(sensed(2), SCENARIO) == 0).all()  # other flocks
+    assert PolicyController(FirstAnchor()).state_dict() == {}
+
+
+def test_recurrent_ppo_acts_as_in_sb3s_loop():
+    env = make_vec_env(SCENARIO, 2, seed=0)
+    kwargs = {"lstm_hidden_size": 8, "net_arch": [8], "log_std_init": -9.0}
+    model = RecurrentPPO("MlpLstmPolicy", env, n_steps=8, batch_size=8, policy_kwargs=kwargs, device="cpu", seed=0)
+    controller, observations, state = PolicyController(model), env.reset(), None
+    starts = np.ones(env.num_envs, bool)
+    for _ in range(6):
+        worlds = [copy.world for copy in env.get_attr("unwrapped", indices=[0, 5])]
+        expected, state = model.predict(observations, state=state, episode_start=starts, deterministic=True)
+        one = place(SCENARIO, worlds[1].positions[0], worlds[1].headings[0], worlds[1].obstacle_positions[0])
+        one.waypoints = worlds[1].waypoints
+        np.testing.assert_allclose(controller.act(one.sense(), SCENARIO)[0], expected[5:], rtol=1e-4, atol=1e-6)
+        observations, _, starts, _ = env.step(expected)
+    stateless, _ = model.predict(observations, deterministic=True)
+    assert np.abs(stateless - model.predict(observations, state, starts, True)[0]).max() > 1e-4
 
 
 def test_a_model_with_vec_normalize_sees_normalized_observations():

@@ -5,7 +5,7 @@ from sb3_flock.controllers import Controller
 from sb3_flock.controllers.olfati_saber import OlfatiSaber
 from sb3_flock.controllers.safety_filter import SafetyFilter
 from sb3_flock.evaluation.rollout import rollout
-from sb3_flock.settings import SettingsError
+from sb3_flock.settings import ActionError, SettingsError
 from sb3_flock.sim import Scenario
 from tests.helpers import place
 
@@ -15,6 +15,27 @@ class FullSpeed(Controller):
 
     def act(self, sensing, scenario):
         return np.full((*sensing.waypoint_distances.shape, 2), (9.0, 0.0), dtype=np.float32)
+
+
+class Constant(Controller):
+    """The same numbers in every step."""
+
+    def __init__(self, numbers):
+        self.numbers = np.array(numbers)
+
+    def act(self, sensing, scenario):
+        return self.numbers
+
+
+def test_actions_that_are_not_finite_or_of_another_shape_are_not_made_safe():
+    world = place(Scenario(), [(0, 0), (1, 1)], [0, 0])
+    wrong = [
+        ([[[0.1, 0.0], [np.nan, 0.0]]], r"action of flock 0 vehicle 1 = \[nan, 0.0\]"),
+        ([0.1, 0.0], r"the shape \(2,\)"),
+    ]
+    for numbers, line in wrong:
+        with pytest.raises(ActionError, match=line):
+            SafetyFilter(Constant(numbers)).act(world.sense(), world.scenario)
 
 
 @pytest.mark.parametrize("level", ["voronoi", "motion"])

@@ -181,7 +181,7 @@ def test_each_copy_queries_its_expert_in_its_own_world(num_cpus):
         assert not any(info["expert_drives"] or "executed_action" in info for info in infos)
         assert len(np.unique(queried.reshape(4, -1), axis=0)) == 4
         if num_cpus == 0:
-            flocks = [flock for copy in env._copies(range(0, 16, 8)) for flock in copy.unwrapped.flocks]
+            flocks = [flock for found in env.get_attr("flocks", indices=range(0, 16, 8)) for flock in found]
             assert all(flock.expert.world is flock.world for flock in flocks)
     finally:
         env.close()

@@ -13,7 +13,8 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import VecMonitor, VecVideoRecorder
 
 from sb3_flock import FlockCNN, Scenario, flatten, flocking_v0, make_vec_env
-from sb3_flock.settings import SettingsError
+from sb3_flock.settings import ActionError, SettingsError
+from tests.envs.scripted import Scripted
 from tests.helpers import assert_equal_rollouts
 
 SCENARIO = Scenario(n_vehicles=3, n_obstacles=1, max_cycles=5)
@@ -313,6 +314,25 @@ def test_slots_are_ordered_copy_by_copy_and_actions_go_to_their_vehicle():
     has_moved = [np.linalg.norm(a - b, axis=-1) > 0 for a, b in zip(after, before, strict=True)]
     assert has_moved[0].tolist() == [False, False, False]
     assert has_moved[1].tolist() == [False, True, False]
+
+
+@pytest.mark.parametrize("number", [np.nan, np.inf])
+def test_actions_that_are_not_finite_are_refused_in_one_line(num_cpus, number):
+    envs = [make_vec_env(SCENARIO, 2, num_cpus, seed=0), flatten(Scripted(), 2, num_cpus, seed=0)]
+    for env in envs:
+        env.reset()
+        actions = np.zeros((env.num_envs, 2), np.float32)
+        actions[4, 1] = number
+        with pytest.raises(ActionError, match=rf"^action of slot 4 = \[0.0, {number}\]: finite numbers are needed$"):
+            env.step(actions)
+        with pytest.raises(ActionError, match=r"^actions have the shape \(2,\): \(\d, 2\) is needed$"):
+            env.step(np.zeros(2, np.float32))
+        env.step(np.zeros_like(actions))
+        env.close()
+    alone = flocking_v0.parallel_env(SCENARIO)
+    alone.reset(seed=0)
+    with pytest.raises(ActionError, match=r"^action of flock 0 vehicle 1 = "):
+        alone.step({agent: actions[4 - (agent != "vehicle_1")] for agent in alone.agents})
 
 
 BAD_COUNTS = [({"n_flocks": 0}, "n_flocks = 0"), ({"num_cpus": -1}, "num_cpus = -1"), ({"seed": -1}, "seed = -1")]

@@ -1,14 +1,14 @@
 import numpy as np
 import pytest
 
-from sb3_flock import FlockPolicy, Scenario, evaluate
+from sb3_flock import FlockPolicy, Scenario, evaluate, render
 from sb3_flock.controllers import Controller, make_controller
 from sb3_flock.controllers.policy import PolicyController
 from sb3_flock.envs.flocking_v0 import action_space, observation_space
 from sb3_flock.evaluation import METRICS, rollout
 from sb3_flock.evaluation.rollout import as_controller, iter_rollout, rollout_batch
 from sb3_flock.serialization.load import PolicyError, load_policy
-from sb3_flock.settings import SettingsError
+from sb3_flock.settings import ActionError, SettingsError
 from sb3_flock.sim import episode_rng
 
 SCENARIO = Scenario(n_vehicles=5, n_obstacles=2, max_cycles=40, arena=0.5, obstacle_arena=0.5)
@@ -127,6 +127,42 @@ def test_a_batch_takes_its_controller_from_the_world():
     values = rollout_batch(make, SCENARIO, [episode_rng(0, episode) for episode in range(3)])
     assert [(world.n_flocks, world.scenario, world.steps) for world in made] == [(3, SCENARIO, 40)]
     np.testing.assert_array_equal(values["return"], rollout(make_controller("go-to-waypoint"), SCENARIO, 3, 0)["return"])
+
+
+class Predicts:
+    """SB3's ``predict`` with the same numbers for every row."""
+
+    def __init__(self, numbers):
+        self.numbers = numbers
+
+    def predict(self, observations, deterministic):
+        return np.tile(np.array(self.numbers, np.float32), (len(observations), 1)), None
+
+
+class Acts(GoToWaypoint):
+    """A controller of one action for all."""
+
+    def act(self, sensing, scenario):
+        return np.array([0.1, 0.0])
+
+
+WRONG = [
+    (Predicts([np.nan, 0.0]), r"^action of flock 0 vehicle 0 = \[nan, 0.0\]: finite numbers are needed$"),
+    (Predicts([0.1, np.inf]), r"^action of flock 0 vehicle 0 = \[0.1\d+, inf\]: finite numbers are needed$"),
+    (Predicts([0.1]), r"^predict gives actions of the shape \(256, 1\): \(256, 2\) is needed$"),
+    (Acts(), r"^actions have the shape \(2,\): \(2, 5, 2\) is needed$"),
+]
+
+
+@pytest.mark.parametrize(("policy", "line"), WRONG, ids=["nan", "inf", "narrow", "broadcast"])
+def test_wrong_actions_are_refused_in_one_line_and_not_evaluated(policy, line, tmp_path):
+    with pytest.raises(ActionError, match=line):
+        evaluate(policy, SCENARIO, episodes=2)
+    with pytest.raises(ActionError, match=line.replace(r"\(2, 5", r"\(1, 5")):
+        list(iter_rollout(policy, SCENARIO))
+    with pytest.raises(ActionError, match=line.replace(r"\(2, 5", r"\(1, 5")):
+        render(policy, SCENARIO, tmp_path / "video.html")
+    assert list(tmp_path.iterdir()) == []
 
 
 class Recorder(GoToWaypoint):

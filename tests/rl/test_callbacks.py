@@ -4,7 +4,7 @@ import pytest
 import supersuit
 from mpe2 import simple_spread_v3
 from stable_baselines3 import A2C, DDPG, PPO
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EveryNTimesteps
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
@@ -208,6 +208,20 @@ def test_on_policy_rewards_are_mixed_and_then_normalized(options):
     np.testing.assert_allclose(callback._returns, np.sum([step[-2] for step in record.steps], 0), rtol=1e-4)
     changes = [np.abs(mixed - [info["reward"] for info in infos]) > 1e-6 for _, infos, _, mixed, _ in record.steps]
     assert np.sum(changes) > 10
+
+
+@pytest.mark.parametrize("is_nested", [False, True])
+def test_rewards_are_not_mixed_twice(is_nested):
+    env, record = make_vec_env(CROWDED, n_flocks=1, seed=1), Record()
+    callback = NeighborInclusiveReward()
+    twice = (
+        [EveryNTimesteps(4, CallbackList([callback])), record, NeighborInclusiveReward()] if is_nested else [callback] * 2
+    )
+    with pytest.raises(SettingsError, match="NeighborInclusiveReward is among the callbacks more than once"):
+        learn(env, twice, 3, FlockCNN)
+    assert record.steps == []
+    for _ in range(2):  # again with the same callback
+        learn(env, [callback, record], 3, FlockCNN)
 
 
 def test_a_wrong_or_missing_number_of_agents_is_refused():

@@ -17,6 +17,7 @@ from stable_baselines3 import DDPG, TD3
 
 from sb3_flock import FlockCNN, FlockPolicy, evaluate, load_policy, make_vec_env
 from sb3_flock.serialization.load import PolicyError
+from sb3_flock.settings import ActionError
 from tests.helpers import SMALL_MODEL
 
 
@@ -210,6 +211,7 @@ def test_bombs_are_refused_within_bounds(saved):
 import resource, sys, time
 from sb3_flock import load_policy
 from sb3_flock.serialization.load import PolicyError
+from sb3_flock.settings import ActionError
 load_policy(sys.argv[1])
 before, start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.monotonic()
 for path in sys.argv[2:]:
@@ -304,3 +306,13 @@ sys.exit(f"imported: {slow & set(sys.modules)}" if slow & set(sys.modules) else 
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_policy_that_computes_nan_is_refused_in_one_line(saved):
+    policy = load_policy(saved)
+    observations = np.zeros((4, 3, 11, 11), np.float32)
+    observations[2] = np.nan
+    with pytest.raises(ActionError, match=r"^action of vehicle 2 = \[nan, nan\]: finite numbers are needed$"):
+        policy.predict(observations)
+    with pytest.raises(ActionError, match=r"^action = \[nan, nan\]: finite numbers are needed$"):
+        policy.predict(observations[2])

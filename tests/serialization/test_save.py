@@ -4,11 +4,13 @@ from importlib.metadata import version
 
 import numpy as np
 import pytest
+import torch as th
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_flock import FlockDDPG, load_policy, make_vec_env, save_model
+from sb3_flock import FlockDDPG, FlockPolicy, TrainingConfig, load_policy, make_vec_env, save_model
 from sb3_flock.rl.registry import build_model
 from sb3_flock.serialization.save import atomic_write, versions
+from sb3_flock.serialization.yaml_io import load_config
 from sb3_flock.settings import SettingsError
 from tests.helpers import SMALL_MODEL
 
@@ -66,6 +68,51 @@ def test_a_model_that_flies_on_normalized_observations_is_refused_in_one_line(tm
         save_model(build_model(SMALL_MODEL, env), tmp_path / "policy.zip", SMALL_MODEL)
     env = VecNormalize(make_vec_env(SMALL_MODEL.scenario, 1, seed=0), norm_obs=False)
     save_model(build_model(SMALL_MODEL, env), tmp_path / "policy.zip", SMALL_MODEL)
+
+
+DIFFERENT = {
+    "n_anchors": (9, "scenario.n_anchors = 9, observations of shape (3, 9, 9): the model's have (3, 11, 11)"),
+    "motion_lag": (0.2, "scenario.motion_lag = 0.2, observations of shape (6, 11, 11): the model's have (3, 11, 11)"),
+    "max_speed": (0.3, "scenario.max_speed = 0.3: the model's actions are Box([ 0."),
+    "max_turn_rate": (1.0, "scenario.max_turn_rate = 1.0: the model's actions are Box([ 0."),
+    "algo": ("sac", "algo = sac, whose policy is a FlockSACPolicy: the model's is a FlockPolicy"),
+    "features_dim": (32, "network.features_dim = 32: the model has 16"),
+    "channels": ([16], "network.channels = [16]: the model has [16, 32]"),
+    "kernel_size": (2, "network.kernel_size = 2: the model has 3"),
+    "stride": (1, "network.stride = 1: the model has 2"),
+    "layer_norm": (False, "network.layer_norm = False: the model has True"),
+    "net_arch": ([64, 64], "network.net_arch = [64, 64]: the model has [64]"),
+    "n_critics": (1, "network.n_critics = 1: the model has 2"),
+    "action_layer": (8, "network.action_layer = 8: the model has 32"),
+    "action_bound": ("tanh", "network.action_bound = tanh: the model has inverting"),
+}
+
+
+@pytest.mark.parametrize("name", DIFFERENT)
+def test_a_config_that_the_model_was_not_built_from_is_refused_with_the_field(model, tmp_path, name):
+    value, line = DIFFERENT[name]
+    state = th.get_rng_state()
+    with pytest.raises(SettingsError) as error:
+        save_model(model, tmp_path / "policy.zip", load_config(TrainingConfig, overrides={name: value}, base=SMALL_MODEL))
+    assert str(error.value).startswith(f"save_model: the config has {line}")
+    assert "\n" not in str(error.value)
+    assert not list(tmp_path.iterdir())
+    assert th.equal(state, th.get_rng_state())
+
+
+def test_what_does_not_change_the_networks_may_differ(model, tmp_path):
+    changes = {"learning_rate": 1e-5, "final_init": 0.1, "n_vehicles": 7, "n_flocks": 3, "link_range": 0.2}
+    config = load_config(TrainingConfig, overrides=changes, base=SMALL_MODEL)
+    assert load_policy(save_model(model, tmp_path / "policy.zip", config)).config == config
+
+
+def test_a_model_of_ones_own_with_other_layers_is_refused_with_the_first(tmp_path):
+    kwargs = {"features_extractor_kwargs": {"features_dim": 16}, "n_critics": 2, "activation_fn": th.nn.Tanh}
+    model = FlockDDPG(FlockPolicy, make_vec_env(n_flocks=1), policy_kwargs=kwargs, buffer_size=10, device="cpu")
+    with pytest.raises(
+        SettingsError, match=r"^save_model: the config has a network with \(1\): ReLU\(\): the model has \(1\): T"
+    ):
+        save_model(model, tmp_path / "policy.zip", SMALL_MODEL)
 
 
 def test_a_write_that_fails_leaves_the_earlier_file_and_nothing_else(tmp_path):

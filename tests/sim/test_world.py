@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sb3_flock.settings import SettingsError
+from sb3_flock.settings import ActionError, SettingsError
 from sb3_flock.sim import Scenario, World, episode_rng
 from sb3_flock.sim.sensing import nearest
 from sb3_flock.sim.world import WorldError, along, waypoints_ahead
@@ -244,3 +244,25 @@ def test_headings_are_changed_as_a_whole():
         world.headings[0, 0] = 1.0  # the frames would be of the headings before
     world.headings = np.array([[np.pi / 2]])
     np.testing.assert_allclose(world.frames[0, 0], (0.0, 1.0), atol=1e-15)
+
+
+@pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf])
+def test_actions_that_are_not_finite_are_refused_in_one_line(number):
+    world = World(Scenario(n_vehicles=3), 2)
+    world.reset([episode_rng(0, 0), episode_rng(0, 1)])
+    actions = np.zeros((2, 3, 2))
+    actions[1, 2, 0] = number
+    before = world.positions.copy()
+    with pytest.raises(ActionError, match=rf"^action of flock 1 vehicle 2 = \[{number}, 0.0\]: finite numbers are needed$"):
+        world.step(actions)
+    np.testing.assert_array_equal(world.positions, before)
+    assert world.steps == 0
+
+
+@pytest.mark.parametrize("shape", [(2,), (3, 2), (1, 3, 2), (2, 1, 2), (2, 3, 1), (2, 3), ()])
+def test_actions_of_another_shape_are_refused_and_not_broadcast(shape):
+    world = World(Scenario(n_vehicles=3), 2)
+    world.reset([episode_rng(0, 0), episode_rng(0, 1)])
+    with pytest.raises(ActionError) as error:
+        world.step(np.zeros(shape))
+    assert str(error.value) == f"actions have the shape {shape}: (2, 3, 2) is needed"
