@@ -41,7 +41,9 @@ env.step(dict.fromkeys(env.agents, (scenario.max_speed, 0.0)))
 speed = np.linalg.norm(env.world.positions[0, 0] - start) / scenario.time_step
 print(f"speed in the first step: {speed:.3f} m/s of the commanded {scenario.max_speed:.3f} m/s")
 
-kwargs = dict(replay_buffer_class=CompactReplayBuffer, learning_starts=1000, buffer_size=50_000, gradient_steps=5, seed=0)
-model = FlockDDPG(FlockPolicy, flatten(env, n_copies=8, seed=0), **kwargs)
+options: dict = dict(
+    replay_buffer_class=CompactReplayBuffer, learning_starts=1000, buffer_size=50_000, gradient_steps=5, seed=0
+)
+model = FlockDDPG(FlockPolicy, flatten(env, n_copies=8, seed=0), **options)
 model.learn(steps, NeighborInclusiveReward(lambda_=0.7))
 print(f"mean return {evaluate_policy(model, flatten(env, 4, seed=1), n_eval_episodes=24, warn=False)[0]:.2f}")

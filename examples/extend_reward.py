@@ -17,7 +17,7 @@ def spacing(sensing, actions, ranges):
 reward = {"extra_terms": {"spacing": 20.0}}
 env = flocking_v0.parallel_env(Scenario(n_vehicles=3, arena=0.12, obstacle_arena=0.6, reward=reward))
 env.reset(seed=1)
-_, _, _, _, infos = env.step({agent: np.array([0.1, 0.0]) for agent in env.agents})
+*_, infos = env.step({agent: np.array([0.1, 0.0]) for agent in env.agents})
 for agent, info in infos.items():
     print(agent, {name: round(term, 4) for name, term in info["reward_terms"].items()})
 

@@ -33,7 +33,7 @@ def measured(points):
     return in_body_frame(position, heading, points)
 
 
-history = []  # measurements with this vehicle's position and heading; only policies with motion channels need it
+history: list = []  # measurements with this vehicle's position and heading; only policies with motion channels need it
 lag_steps = round(task["motion_lag"] / task["time_step"])
 
 for step in range(100):

@@ -30,5 +30,6 @@ spread = simple_spread_v3.parallel_env(N=3, local_ratio=1.0, continuous_actions=
 env = flatten(NeighborsWithinOne(spread), n_copies=4, seed=0)
 model = DDPG("MlpPolicy", env, learning_starts=500, buffer_size=50_000, gradient_steps=2)
 model.learn(int(sys.argv[1]) if len(sys.argv) > 1 else 20_000, callback=NeighborInclusiveReward(lambda_=0.5))
+assert model.replay_buffer is not None  # it is off policy
 print(f"{model.num_timesteps} transitions, mean stored reward {model.replay_buffer.rewards[:100].mean():.3f}")
-Image.fromarray(env.render()).save("neighbors_of_another_env.png")
+Image.fromarray(np.asarray(env.render())).save("neighbors_of_another_env.png")

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from sb3_flock.envs.vec_env import flatten, make_vec_env
     from sb3_flock.envs.vec_reward import VecNeighborInclusiveReward
     from sb3_flock.evaluation import evaluate, register_metric
+    from sb3_flock.pretrained import policy_path
     from sb3_flock.rl.buffers import CompactReplayBuffer
     from sb3_flock.rl.callbacks import DropDeadTransitions, NeighborInclusiveReward
     from sb3_flock.rl.ddpg import FlockDDPG, FlockTD3
@@ -61,6 +62,7 @@ __all__ = [
     "load_policy",
     "make_controller",
     "make_vec_env",
+    "policy_path",
     "register_algorithm",
     "register_channel",
     "register_controller",
@@ -96,6 +98,7 @@ _HOMES = {
     "load_policy": "serialization.load",
     "make_controller": "controllers",
     "make_vec_env": "envs.vec_env",
+    "policy_path": "pretrained",
     "register_algorithm": "rl.registry",
     "register_channel": "sim",
     "register_controller": "controllers",
@@ -119,7 +122,7 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *__all__])
+    return sorted([*__all__, "__version__", *(name for name in globals() if name.startswith("__"))])
 
 
 _renamed.install()

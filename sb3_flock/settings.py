@@ -7,10 +7,11 @@ line's ``--help`` and the comments of every YAML file are made from it.
 from __future__ import annotations
 
 import difflib
+import inspect
 import numbers
 import reprlib
 from collections.abc import Iterable, Mapping
-from typing import Annotated, Any, TypeVar, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeVar, get_origin
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
@@ -44,8 +45,37 @@ NotNegative = Annotated[float, Field(ge=0, le=1e6)]
 Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
 
 
-class Settings(BaseModel):
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+    class _Model:
+        """Pydantic's base class for type checkers.
+
+        They would take a parameter with a positional default in ``Field`` for a required one, and refuse a dict for a group.
+        """
+
+        model_config: ClassVar[ConfigDict]
+        model_fields: ClassVar[dict[str, FieldInfo]]
+
+        def __init__(self, **values: Any) -> None: ...
+        @property
+        def model_fields_set(self) -> set[str]: ...
+        def model_copy(self, **options: Any) -> Self: ...
+        def model_dump(self, **options: Any) -> dict[str, Any]: ...
+        def model_dump_json(self, **options: Any) -> str: ...
+        @classmethod
+        def model_json_schema(cls, **options: Any) -> dict[str, Any]: ...
+        @classmethod
+        def model_validate(cls, obj: Any, **options: Any) -> Self: ...
+
+else:
+    _Model = BaseModel
+
+
+class Settings(_Model):
     """Frozen, validated parameters that refuse unknown names.
+
+    The docstring of a class lists its fields.
 
     :raises SettingsError: one line per wrong parameter, naming it, its value and what is accepted
     """
@@ -60,6 +90,12 @@ class Settings(BaseModel):
             super().__init__(**values)
         except ValidationError as error:
             raise SettingsError(*(_describe(type(self), e) for e in error.errors())) from None
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **options: Any) -> None:
+        """Add the fields to the docstring, for ``help()``."""
+        fields = "\n".join(f":param {name}: {field.description}" for name, field in cls.model_fields.items())
+        cls.__doc__ = f"{inspect.cleandoc(cls.__doc__ or '')}\n\n{fields}"
 
     def replace(self: _Settings, **changes: Any) -> _Settings:
         """A validated copy with some fields changed.

@@ -6,11 +6,11 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from sb3_flock.controllers import Controller
 from sb3_flock.envs.batch import copy_flocks, select_flocks
-from sb3_flock.envs.flocking_v0 import Action, Observation, parallel_env
+from sb3_flock.envs.flocking_v0 import Observation, parallel_env
 from sb3_flock.sim import Scenario, Sensing, World
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ class ExpertEnv(parallel_env):
         return bool(self._drives.any())
 
     def step(
-        self, actions: dict[str, Action]
+        self, actions: Mapping[str, ArrayLike]
     ) -> tuple[dict[str, Observation], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
         """Move everything by one sampling period, by the expert's actions in its episodes."""
         drives = np.repeat(self._drives, self.scenario.n_vehicles)
@@ -82,7 +82,7 @@ class ExpertEnv(parallel_env):
                 info["expert_action"] = expert_action
         return result
 
-    def commands(self, actions: Mapping[str, Action]) -> NDArray[np.float64]:
+    def commands(self, actions: Mapping[str, ArrayLike]) -> NDArray[np.float64]:
         """The actions for the world, ``(flocks, vehicles, 2)`` [m/s, rad/s]: the expert's in its episodes."""
         commands = super().commands(actions)
         if self._next_actions is not None:

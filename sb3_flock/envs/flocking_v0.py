@@ -44,7 +44,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils import wrappers
 from pettingzoo.utils.conversions import parallel_to_aec
@@ -162,7 +162,7 @@ class parallel_env(ParallelEnv[str, Observation, Action]):  # noqa: N801 - Petti
         return self._observations(sensing), {agent: {} for agent in self.agents}
 
     def step(
-        self, actions: dict[str, Action]
+        self, actions: Mapping[str, ArrayLike]
     ) -> tuple[dict[str, Observation], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
         """Move everything by a sampling period, or by several; see the module's page for what comes back."""
         sensing, terms = self._advance(self.commands(actions))
@@ -259,7 +259,7 @@ class parallel_env(ParallelEnv[str, Observation, Action]):  # noqa: N801 - Petti
         """What the vehicles measure of what there is; the env calls it once a step, before it returns the observations."""
         return self.world.sensors.measure(sensing)
 
-    def commands(self, actions: Mapping[str, Action]) -> NDArray[np.float64]:
+    def commands(self, actions: Mapping[str, ArrayLike]) -> NDArray[np.float64]:
         """The actions for the world, ``(flocks, vehicles, 2)`` [m/s, rad/s]; the env calls it once a step."""
         given = np.array([actions[agent] for agent in self.agents], dtype=np.float64)
         return given.reshape(-1, self.scenario.n_vehicles, 2)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pettingzoo import ParallelEnv
 
 from sb3_flock.envs.flocking_v0 import Action, Observation, parallel_env
@@ -61,7 +61,7 @@ class MultiFlockEnv(ParallelEnv[str, Observation, Action]):
         return self._joined([observations for observations, _ in starts]), self._joined([infos for _, infos in starts])
 
     def step(
-        self, actions: dict[str, Action]
+        self, actions: Mapping[str, ArrayLike]
     ) -> tuple[dict[str, Observation], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
         """Move every flock by one sampling period; ``info["neighbors"]`` counts the agents of all flocks of a copy."""
         results, first = [], 0

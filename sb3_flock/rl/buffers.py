@@ -44,11 +44,13 @@ class CompactReplayBuffer(ReplayBuffer):
         is as valid as the original. The last axis of the observations ``(channels, l, l)`` is reversed, and the second action,
         the turn rate, changes its sign
     :param store_expert_actions: also store each info's ``expert_action`` ``(2,)`` [m/s, rad/s], see
-        :class:`~sb3_flock.envs.expert_env.ExpertEnv`; samples are then :class:`ExpertReplayBufferSamples`
-    :raises SettingsError: for ``mirror_augmentation`` with other observations or actions; if an added transition has no
-        ``expert_action`` although they are to be stored
+        :class:`~sb3_flock.envs.expert_env.ExpertEnv`, and NaN where it has none; samples are then
+        :class:`ExpertReplayBufferSamples`
+    :raises SettingsError: for ``mirror_augmentation`` with other observations or actions
 
     The other parameters are those of SB3's ``ReplayBuffer``.
+
+    :ivar lacks_expert_actions: whether an agent's info had no ``expert_action`` although they are stored
     """
 
     def __init__(
@@ -92,6 +94,7 @@ class CompactReplayBuffer(ReplayBuffer):
         self.handle_timeout_termination = handle_timeout_termination
         self.mirror_augmentation = mirror_augmentation
         self.expert_actions = np.zeros_like(self.actions) if store_expert_actions else None
+        self.lacks_expert_actions = False
         self.alive = np.ones((self.buffer_size, n_envs), bool)
         self._last_observations: dict[int, dict[int, NDArray[np.float16]]] = {}
 
@@ -111,14 +114,13 @@ class CompactReplayBuffer(ReplayBuffer):
             self._last_observations[self.pos] = {env: next_obs[env].copy() for env in np.flatnonzero(done).tolist()}
         self.alive[self.pos] = alive = [info.get("alive", True) for info in infos]
         if self.expert_actions is not None:
-            if not all("expert_action" in info for info, acts in zip(infos, alive, strict=True) if acts):
-                raise SettingsError(
-                    "store_expert_actions = True: the infos have no expert_action; an ExpertEnv with queries=True gives it, "
-                    "and a model without bc_coef does not need it"
-                )
+            self.lacks_expert_actions |= not all(
+                "expert_action" in info for info, acts in zip(infos, alive, strict=True) if acts
+            )
             low, high = self.action_space.low, self.action_space.high  # type: ignore[attr-defined]
+            none = np.full_like(low, np.nan)
             self.expert_actions[self.pos] = (
-                2 * (np.array([info.get("expert_action", low) for info in infos]) - low) / (high - low) - 1
+                2 * (np.array([info.get("expert_action", none) for info in infos]) - low) / (high - low) - 1
             )
         super().add(obs, next_obs, action, reward, done, infos)
 

@@ -8,6 +8,8 @@ import numpy as np
 import torch as th
 from numpy.typing import ArrayLike
 from stable_baselines3 import DDPG, TD3
+from stable_baselines3.common.noise import VectorizedActionNoise
+from stable_baselines3.common.type_aliases import RolloutReturn
 from torch.nn import functional as F  # noqa: N812 - torch's name for it
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
@@ -35,6 +37,12 @@ class FlockTD3(TD3):
         self.compiled, self.update_threads = compiled, update_threads
         self._update: CompiledUpdate | None = None
         super().__init__(*args, **kwargs)
+
+    def _setup_model(self) -> None:
+        noise = self.action_noise
+        if isinstance(noise, VectorizedActionNoise) and noise.n_envs != self.n_envs:  # of a file that SB3 saved
+            self.action_noise = noise.base_noise
+        super()._setup_model()
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_update", "update_threads"]
@@ -104,6 +112,19 @@ class FlockDDPG(FlockTD3, DDPG):
             raise SettingsError(
                 f"bc_coef = {self.bc_coef}: a CompactReplayBuffer with store_expert_actions=True is needed, or bc_coef 0"
             )
+
+    def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
+        """As SB3's.
+
+        :raises SettingsError: if ``bc_coef`` is not 0 and the infos have no ``expert_action``
+        """
+        collected = super().collect_rollouts(*args, **kwargs)
+        if self.bc_coef and getattr(self.replay_buffer, "lacks_expert_actions", False):
+            raise SettingsError(
+                f"bc_coef = {self.bc_coef}: the infos have no expert_action; an ExpertEnv with queries=True gives it, "
+                "or bc_coef 0 is needed"
+            )
+        return collected
 
     def _train_by_torch(self, gradient_steps: int, batch_size: int) -> None:
         """The reference of the compiled update."""

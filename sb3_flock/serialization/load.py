@@ -19,8 +19,10 @@ from typing import Any
 import numpy as np
 import torch as th
 from stable_baselines3 import PPO, SAC, TD3
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import get_device
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_wrapper
 from torch import nn
 
 from sb3_flock._renamed import POLICIES, warn_renamed
@@ -28,8 +30,9 @@ from sb3_flock.config.training import TrainingConfig
 from sb3_flock.envs.flocking_v0 import action_space, observation_space
 from sb3_flock.pretrained import shipped_policies
 from sb3_flock.rl.ddpg import FlockDDPG
-from sb3_flock.rl.registry import ALGORITHMS, fewest_parameters, policy_kwargs
+from sb3_flock.rl.registry import ALGORITHMS, build_model, fewest_parameters, policy_kwargs
 from sb3_flock.serialization.migrate import FORMAT, MEMBER, check_format, migrate_config, migrate_weights
+from sb3_flock.serialization.yaml_io import load_config
 from sb3_flock.settings import SettingsError, UserError
 from sb3_flock.sim import Scenario, check_actions
 
@@ -49,6 +52,8 @@ class LoadedPolicy:
     config: TrainingConfig
     versions: dict[str, str]
     num_timesteps: int
+    has_config: bool = True
+    """Whether the file holds the config; otherwise a default one is assumed, with networks as far as the tensors show them."""
 
     @property
     def scenario(self) -> Scenario:
@@ -101,6 +106,51 @@ class LoadedPolicy:
         actions, state = self.policy.predict(observation, state, episode_start, deterministic)
         check_actions(actions, actions.shape, *["vehicle"] * (actions.ndim - 1))
         return actions, state
+
+    def to_model(self, env: VecEnv, **changes: Any) -> OffPolicyAlgorithm:
+        """A model with these networks that learns on in an env, with the algorithm and the parameters that trained the policy.
+
+        The exploration noise, the number of updates a step and the learning rate's schedule start anew for this env. Behavior
+        cloning (``bc_coef``) stays where the env's expert is queried in every step
+        (:class:`~sb3_flock.envs.expert_env.ExpertEnv`), and is 0 elsewhere. The optimizers and the replay buffer are empty; the
+        first ``learning_starts`` actions are random.
+
+        :param env: the vector env, with any number of slots
+        :param changes: parameters of the training by name, such as ``learning_rate`` or ``learning_starts``
+        :raises PolicyError: if the file holds no config of its networks, or the policy does not fit the env
+        :raises SettingsError: for an unknown parameter or a value that is not accepted
+        """
+        if not self.has_config:
+            raise PolicyError(f"{self.path}: saved without a config of its networks; SB3's own load reads it")
+        if (
+            env.observation_space.shape != self.policy.observation_space.shape
+            or env.action_space != self.policy.action_space
+        ):
+            raise PolicyError(
+                f"{self.path}: its observations of shape {self.policy.observation_space.shape} and actions in "
+                f"{self.policy.action_space} are not the env's: {env.observation_space.shape} and {env.action_space}"
+            )
+        normalize = unwrap_vec_wrapper(env, VecNormalize)
+        if normalize is not None and normalize.norm_obs:
+            raise PolicyError(f"{self.path}: it was trained without VecNormalize, whose norm_obs=False is needed")
+        for scenario in _attributes(env, "scenario")[:1]:
+            self.check(scenario)
+        if not any(_attributes(env, "queries")):
+            changes = {"bc_coef": 0.0, **changes}
+        config = load_config(TrainingConfig, overrides={"device": str(self.policy.device), **changes}, base=self.config)
+        if (config.algo, config.network) != (self.config.algo, self.config.network):
+            raise SettingsError("to_model: algo and the networks are those of the file and cannot change")
+        model = build_model(config, env)
+        model.policy.load_state_dict(self.policy.state_dict())
+        return model
+
+
+def _attributes(env: VecEnv, name: str) -> list[Any]:
+    """An attribute of each slot's env; empty where there is none, or workers hold the envs."""
+    try:
+        return env.get_attr(name)
+    except (AttributeError, NotImplementedError):
+        return []
 
 
 def check_device(device: str) -> None:
@@ -184,7 +234,7 @@ def load_policy(path: str | Path, device: str = "cpu", trust: bool = False) -> L
     if not has_member:
         warnings.warn(f"{path}: saved without its scenario; the default is assumed", stacklevel=2)
     policy.to(torch_device).set_training_mode(False)
-    return LoadedPolicy(path, policy, config, trained_with, num_timesteps)
+    return LoadedPolicy(path, policy, config, trained_with, num_timesteps, has_member)
 
 
 _MAX_JSON = 2**20

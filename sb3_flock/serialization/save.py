@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.noise import VectorizedActionNoise
 from stable_baselines3.common.policies import BasePolicy
 
 from sb3_flock._compat import EPISODE_STATE, optimizers_of
@@ -48,6 +49,8 @@ def save_model(
 ) -> Path:
     """Save a model as SB3 does, with the JSON member, whole or not at all.
 
+    The action noise is saved for one slot: SB3 loads the file with an env of any number of slots.
+
     :param path: the zip to write
     :param config: the config that the model was built from; what :func:`~sb3_flock.serialization.load.load_policy` reads
     :param optimizers: keep the optimizers' states, which further training needs and inference does not; without them the file
@@ -73,7 +76,7 @@ def save_model(
         "versions": versions(),
     }
     with atomic_write(path) as aside:
-        with open(aside, "wb") as file, nullcontext() if optimizers else _fresh_optimizers(model):
+        with open(aside, "wb") as file, _noise_of_one_slot(model), nullcontext() if optimizers else _fresh_optimizers(model):
             model.save(file, exclude=EPISODE_STATE)
         with zipfile.ZipFile(aside, "a", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
             archive.writestr(MEMBER, json.dumps(member, indent=1))
@@ -145,6 +148,19 @@ def atomic_write(path: Path) -> Iterator[Path]:
             os.fsync(folder)
         finally:
             os.close(folder)
+
+
+@contextmanager
+def _noise_of_one_slot(model: BaseAlgorithm) -> Iterator[None]:
+    """Temporarily the action noise that each slot has, which SB3 multiplies again where a model learns."""
+    noise = getattr(model, "action_noise", None)
+    if isinstance(noise, VectorizedActionNoise):
+        model.action_noise = noise.base_noise
+    try:
+        yield
+    finally:
+        if noise is not None:
+            model.action_noise = noise
 
 
 @contextmanager

@@ -87,7 +87,7 @@ def save(figure: Figure, stem: str | Path) -> None:
         save_as(figure, Path(f"{stem}.{kind}"), kind)
 
 
-def save_as(figure: Figure, path: Path | BinaryIO, kind: str) -> None:
+def save_as(figure: Figure, path: str | Path | BinaryIO, kind: str) -> None:
     """Write a ``"png"`` or an ``"svg"``, whatever the file's name."""
     import matplotlib as mpl
 

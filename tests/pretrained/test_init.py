@@ -2,11 +2,13 @@ import json
 import zipfile
 
 import pytest
+from stable_baselines3 import DDPG
 
-from sb3_flock import load_policy
+from sb3_flock import load_policy, make_vec_env
 from sb3_flock._renamed import POLICIES, RenamedWarning
-from sb3_flock.pretrained import shipped_policies
+from sb3_flock.pretrained import policy_path, shipped_policies
 from sb3_flock.serialization.load import PolicyError
+from sb3_flock.settings import SettingsError
 
 TASKS = ("3v1o", "5v1o", "5v2o")
 NAMES = {"crossing-5v2o", "general", *(f"{method}-{task}" for method in ("ddpg", "ddpg-bc") for task in TASKS)}
@@ -31,6 +33,25 @@ def test_each_shipped_policy_loads_by_name_for_the_task_in_its_name(name, tmp_pa
         assert name.endswith(f"{vehicles}v{obstacles}o")
     assert bool(policy.scenario.motion_lag) == (name not in {f"ddpg-{task}" for task in TASKS})
     assert (policy.config.algorithm.bc_coef > 0) == bool(policy.scenario.motion_lag)
+
+
+@pytest.mark.parametrize("name", ["ddpg-3v1o", "ddpg-bc-5v2o"])
+@pytest.mark.parametrize("n_flocks", [1, 3])
+def test_sb3_loads_a_shipped_policy_and_learns_with_any_number_of_slots(name, n_flocks):
+    env = make_vec_env(load_policy(name).scenario, n_flocks, seed=0)
+    model = DDPG.load(policy_path(name), env, device="cpu", custom_objects={"buffer_size": 2000, "gradient_steps": 1})
+    model.learning_starts = 20
+    model.learn(40 + env.num_envs)
+    assert len(model.action_noise.noises) == env.num_envs
+
+
+def test_the_path_of_a_shipped_policy():
+    assert policy_path("general") == shipped_policies()["general"]
+    with pytest.raises(SettingsError, match=r"policy = 'ddpg-3v10': one of .*general is needed; did you mean ddpg-3v1o\?"):
+        policy_path("ddpg-3v10")
+    for old, new in POLICIES.items():
+        with pytest.warns(RenamedWarning, match=f"policy {old} is now {new}"):
+            assert policy_path(old) == shipped_policies()[new]
 
 
 @pytest.mark.parametrize(("old", "new"), POLICIES.items())

@@ -172,6 +172,7 @@ def test_only_living_agents_need_an_expert_action():
     observations, infos = np.zeros((2, *SPACES[0].shape), np.float32), [{"expert_action": SPACES[1].high}, {"alive": False}]
     buffer.add(observations, observations, np.zeros((2, 2)), np.zeros(2), np.zeros(2, bool), infos)
     assert (buffer.sample(9).expert_actions == 1).all()
+    assert not buffer.lacks_expert_actions
 
 
 def test_a_state_of_the_previous_release_has_living_agents_alone():
@@ -200,10 +201,12 @@ def test_a_million_transitions_fit_into_a_gigabyte():
     assert sum(array.nbytes for array in arrays) + last_observations < 0.8e9
 
 
-def test_transitions_without_an_expert_action_are_refused_in_one_line():
+def test_transitions_without_an_expert_action_are_known():
     buffer = CompactReplayBuffer(80, *SPACES, device="cpu", n_envs=N_ENVS, store_expert_actions=True)
-    with pytest.raises(SettingsError, match="store_expert_actions = True: the infos have no expert_action"):
-        fill(buffer, 1)
+    assert not buffer.lacks_expert_actions
+    fill(buffer, 1)
+    assert buffer.lacks_expert_actions
+    assert buffer.sample(5).expert_actions.isnan().all()
 
 
 def test_arguments_of_the_previous_release_warn_and_work():

@@ -89,6 +89,23 @@ def test_bc_coef_without_expert_actions_is_refused_in_one_line():
         FlockDDPG(FlockPolicy, make_vec_env(n_flocks=1), bc_coef=2.0, device="cpu")
 
 
+def test_infos_without_expert_actions_are_refused_before_an_update_where_bc_coef_needs_them():
+    kwargs = {"replay_buffer_class": CompactReplayBuffer, "replay_buffer_kwargs": {"store_expert_actions": True}}
+    options = {"buffer_size": 400, "learning_starts": 3, "device": "cpu", **kwargs}
+    ddpg = FlockDDPG(FlockPolicy, make_vec_env(n_flocks=1), bc_coef=2.0, **options)
+    with pytest.raises(
+        SettingsError, match="^bc_coef = 2.0: the infos have no expert_action; an ExpertEnv with queries=True"
+    ):
+        ddpg.learn(60)
+    assert ddpg._n_updates == 0
+    ddpg.bc_coef = 0.0
+    ddpg.learn(60)
+    sb3s = DDPG(FlockPolicy, make_vec_env(n_flocks=1), **options)  # which clones no behavior
+    sb3s.learn(60)
+    assert min(ddpg._n_updates, sb3s._n_updates) > 0
+    assert all(th.isfinite(parameter).all() for one in (ddpg, sb3s) for parameter in one.policy.parameters())
+
+
 def test_guidance_of_the_previous_release_warns_and_is_bc_coef():
     options = {"replay_buffer_class": CompactReplayBuffer, "replay_buffer_kwargs": {"store_expert_actions": True}}
     env = make_vec_env(n_flocks=1)

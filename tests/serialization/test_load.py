@@ -5,6 +5,7 @@ import io
 import json
 import os
 import pickle
+import re
 import shutil
 import subprocess
 import sys
@@ -14,11 +15,12 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3 import DDPG, TD3
+from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_flock import FlockCNN, FlockPolicy, evaluate, load_policy, make_vec_env
+from sb3_flock import FlockCNN, FlockDDPG, FlockPolicy, Scenario, evaluate, load_policy, make_vec_env
 from sb3_flock.serialization.load import PolicyError
-from sb3_flock.settings import ActionError
-from tests.helpers import SMALL_MODEL
+from sb3_flock.settings import ActionError, SettingsError
+from tests.helpers import SMALL_MODEL, expert_vec_env
 
 
 def rewrite(path, changes):
@@ -316,3 +318,63 @@ def test_a_policy_that_computes_nan_is_refused_in_one_line(saved):
         policy.predict(observations)
     with pytest.raises(ActionError, match=r"^action = \[nan, nan\]: finite numbers are needed$"):
         policy.predict(observations[2])
+
+
+# -- learning on -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("name", "n_flocks"), [("ddpg-3v1o", 1), ("ddpg-3v1o", 4), ("ddpg-bc-5v2o", 2)])
+def test_a_shipped_policy_learns_on_with_any_number_of_slots(name, n_flocks):
+    policy = load_policy(name)
+    env = make_vec_env(policy.scenario.replace(n_vehicles=4), n_flocks, seed=0)
+    model = policy.to_model(env, learning_starts=40, buffer_size=2000, batch_size=16)
+    assert isinstance(model, FlockDDPG)
+    observations = env.reset()
+    np.testing.assert_allclose(
+        model.predict(observations, deterministic=True)[0], policy.predict(observations)[0], atol=1e-6
+    )
+    critics = model.critic.state_dict()
+    assert all(th.equal(tensor, critics[key]) for key, tensor in policy.policy.critic.state_dict().items())
+    assert model.gradient_steps == max(1, round(policy.config.algorithm.utd_ratio * env.num_envs))
+    assert (model.bc_coef, model.replay_buffer.expert_actions) == (0.0, None)
+    model.learn(60)
+    assert len(model.action_noise.noises) == env.num_envs
+    assert model._n_updates > 0
+    assert np.abs(model.predict(observations, deterministic=True)[0] - policy.predict(observations)[0]).max() > 0
+    assert policy.policy.actor is not model.actor
+
+
+def test_behavior_cloning_stays_with_an_expert_that_is_queried():
+    policy = load_policy("ddpg-bc-3v1o")
+    model = policy.to_model(
+        expert_vec_env(policy.scenario), learning_starts=12, buffer_size=2000, batch_size=8, learning_rate=1e-5
+    )
+    assert model.bc_coef == policy.config.algorithm.bc_coef > 0
+    assert model.lr_schedule(1.0) == 1e-5
+    model.learn(30)
+    assert model._n_updates > 0
+
+
+def test_what_does_not_fit_the_policy_is_refused_in_one_line(saved, tmp_path):
+    policy = load_policy(saved)
+    wrong = [
+        (Scenario(n_anchors=9), "its observations of shape (3, 11, 11) and actions in"),
+        (Scenario(max_speed=0.3), "are not the env's"),
+    ]
+    for scenario, line in wrong:
+        with pytest.raises(PolicyError, match=re.escape(line)):
+            policy.to_model(make_vec_env(scenario, 1))
+    with pytest.raises(PolicyError, match="trained without VecNormalize"):
+        policy.to_model(VecNormalize(make_vec_env(n_flocks=1)))
+    with pytest.raises(SettingsError, match="color is not a parameter"):
+        policy.to_model(make_vec_env(n_flocks=1), color="red")
+    with pytest.raises(SettingsError, match="algo and the networks are those of the file"):
+        policy.to_model(make_vec_env(n_flocks=1), features_dim=32)
+    with pytest.warns(UserWarning, match="link_range = 0.15, evaluated with 0.2"):
+        policy.to_model(make_vec_env(Scenario(link_range=0.2), 1))
+    plain = tmp_path / "plain.zip"
+    DDPG(FlockPolicy, make_vec_env(n_flocks=1), buffer_size=10, device="cpu").save(plain)
+    with pytest.warns(UserWarning, match="saved without its scenario"):
+        policy = load_policy(plain)
+    with pytest.raises(PolicyError, match="saved without a config of its networks"):
+        policy.to_model(make_vec_env(n_flocks=1))

@@ -5,6 +5,7 @@ from importlib.metadata import version
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3 import DDPG
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_flock import FlockDDPG, FlockPolicy, TrainingConfig, load_policy, make_vec_env, save_model
@@ -37,6 +38,29 @@ def test_a_file_without_optimizer_states_is_smaller_acts_the_same_and_trains_on(
     assert not loaded.actor.optimizer.state
     loaded.learn(12)
     assert loaded.actor.optimizer.state
+
+
+@pytest.mark.parametrize(("trained", "loaded"), [(1, 3), (3, 1)])
+@pytest.mark.parametrize("algorithm", [DDPG, FlockDDPG])
+def test_sb3_loads_a_file_and_learns_with_any_number_of_slots(tmp_path, algorithm, trained, loaded):
+    model = build_model(SMALL_MODEL, make_vec_env(SMALL_MODEL.scenario, trained, seed=0))
+    model.learn(2 * model.n_envs)
+    noise = model.action_noise
+    save_model(model, tmp_path / "policy.zip", SMALL_MODEL)
+    assert model.action_noise is noise
+    env = make_vec_env(SMALL_MODEL.scenario, loaded, seed=0)
+    again = algorithm.load(tmp_path / "policy.zip", env, device="cpu")
+    again.learn(2 * env.num_envs)
+    assert len(again.action_noise.noises) == env.num_envs
+
+
+def test_our_algorithms_load_what_sb3_saved_for_any_number_of_slots(tmp_path):
+    model = build_model(SMALL_MODEL, make_vec_env(SMALL_MODEL.scenario, 1, seed=0))
+    model.learn(2 * model.n_envs)
+    model.save(tmp_path / "model.zip")
+    again = FlockDDPG.load(tmp_path / "model.zip", make_vec_env(SMALL_MODEL.scenario, 3, seed=0), device="cpu")
+    again.learn(2 * again.n_envs)
+    assert len(again.action_noise.noises) == again.n_envs == 9
 
 
 def test_a_file_does_not_grow_with_the_number_of_flocks(tmp_path):
