@@ -103,7 +103,8 @@ def optimize(
                 plan_gradient[i, t, 1] = to_heading[i] * max_turn
                 # Turning does not move a standing vehicle. Its speed counts as at least 0.5 here, or it would never turn around.
                 sideways = later[i, 1] * cos[t, i] - later[i, 0] * sin[t, i]
-                to_heading[i] += sideways * max(strides[t, i], 0.5 * max_step)
+                speed = plan[i, t, 0] if held_by[t, i] < 0 else strides[t, i] / max_step
+                to_heading[i] += sideways * max_step * max(speed, 0.5)
             if safety.rounds:
                 _make_way(later, plan_gradient[:, t, 0], held_by[t], slack[t], trajectory[t], max_step)
         # Adam with beta1 = 0.8 and beta2 = 0.9.

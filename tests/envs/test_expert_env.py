@@ -222,7 +222,7 @@ def test_the_replay_buffer_stores_the_executed_and_the_queried_actions(tmp_path)
     queried = model.policy.unscale_action(buffer.expert_actions[: buffer.pos])
     np.testing.assert_allclose(queried, record.queried, atol=1e-6)
     model.save(tmp_path / "with_expert.zip")
-    with pytest.raises(SettingsError, match="store_expert_actions = True"):
+    with pytest.raises(SettingsError, match="the infos have no expert_action"):
         FlockDDPG.load(tmp_path / "with_expert.zip", env=make_vec_env(Scenario(), n_flocks=6), device="cpu").learn(400)
 
 
