@@ -67,11 +67,12 @@ VALUES: dict[tuple[str, str], dict[str, str]] = {
 """Old to new values, by class and parameter."""
 
 POLICIES = {
-    f"{old}-{task}": f"{new}-{task}"
-    for old, new in (("paper", "ddpg"), ("second-look", "ddpg-bc"))
-    for task in ("3v1o", "5v1o", "5v2o")
+    **{f"{old}-{task}": "ddpg" for old in ("paper", "ddpg") for task in ("3v1o", "5v1o", "5v2o")},
+    **{f"{old}-{task}": "flock" for old in ("second-look", "ddpg-bc") for task in ("3v1o", "5v1o", "5v2o")},
+    "general": "flock",
+    "crossing-5v2o": "flock",
 }
-"""Old to new names of the shipped policies."""
+"""Earlier shipped policies, and those that replaced them."""
 
 _MODULES = {
     "evaluation.compare": "viz.compare",
@@ -187,6 +188,19 @@ def warn_renamed(what: str, now: str, stacklevel: int = 2) -> None:
     :param stacklevel: as in :func:`warnings.warn`, counted from the caller
     """
     warnings.warn(f"{what} is now {now}; the old name works for one release", RenamedWarning, stacklevel=stacklevel + 1)
+
+
+def current_policy(name: str, stacklevel: int = 2) -> str:
+    """The name of the shipped policy that replaced one of an earlier release, with a warning; other names as they are.
+
+    :param stacklevel: as in :func:`warn_renamed`
+    """
+    if name not in POLICIES:
+        return name
+    new = POLICIES[name]
+    text = f"policy {name} is now {new}, with its own task and the safety filter; the old name works for one release"
+    warnings.warn(text, RenamedWarning, stacklevel=stacklevel + 1)
+    return new
 
 
 def rename_fields(owner: str, values: Mapping[str, Any]) -> tuple[dict[str, Any], list[tuple[str, str]]]:

@@ -17,10 +17,11 @@ from sb3_flock.controllers import CONTROLLERS, Controller, make_controller
 from sb3_flock.envs.vec_env import make_vec_env
 from sb3_flock.evaluation import robustness
 from sb3_flock.evaluation.metrics import METRICS, EpisodeMetric, Metric, columns
-from sb3_flock.evaluation.model_cards import median_of_seeds, read_card
+from sb3_flock.evaluation.model_cards import over_seeds, read_card
 from sb3_flock.evaluation.report import PAPER
 from sb3_flock.evaluation.robustness import evaluate_with_errors
 from sb3_flock.evaluation.rollout import evaluate
+from sb3_flock.evaluation.tasks import CROSSING, EXPERIMENTS, TASKS, with_bodies_of
 from sb3_flock.rl.callbacks import NeighborInclusiveReward
 from sb3_flock.rl.registry import build_model
 from sb3_flock.serialization.load import LoadedPolicy, load_policy
@@ -28,18 +29,6 @@ from sb3_flock.serialization.save import versions
 from sb3_flock.settings import SettingsError
 from sb3_flock.sim import Scenario
 from sb3_flock.viz.figures import check_matplotlib, plot_lines, plot_observation, plot_trajectories, record_trajectory, save
-
-EXPERIMENTS = {
-    "3v1o": Scenario(n_vehicles=3, n_obstacles=1),
-    "5v1o": Scenario(n_vehicles=5, n_obstacles=1),
-    "5v2o": Scenario(n_vehicles=5, n_obstacles=2),
-}
-"""The paper's experiments by name, a table each."""
-
-CROSSING = {"5v2o-crossing": Scenario(n_vehicles=5, n_obstacles=2, obstacle_motion="crossing")}
-"""The tasks with obstacles that cross the flock by name, a table each."""
-
-TASKS = {**EXPERIMENTS, **CROSSING}
 
 FILTERS = ("off", "announce")
 """The safety filters with which each controller is evaluated, a row each."""
@@ -57,16 +46,10 @@ class Rows:
     filters: tuple[str, ...] = FILTERS
 
 
-_PAPER_OBSERVATION, _EXPERT = "the paper's observation", "motion channels, expert"
-
 ROWS = (
-    Rows("ddpg-3v1o", _PAPER_OBSERVATION, tasks=("3v1o",)),
-    Rows("ddpg-5v1o", _PAPER_OBSERVATION, tasks=("5v1o",)),
-    Rows("ddpg-5v2o", _PAPER_OBSERVATION, tasks=("5v2o", "5v2o-crossing")),
-    Rows("ddpg-bc-3v1o", _EXPERT, tasks=("3v1o",)),
-    Rows("ddpg-bc-5v1o", _EXPERT, tasks=("5v1o",)),
-    Rows("ddpg-bc-5v2o", _EXPERT, tasks=("5v2o", "5v2o-crossing")),
-    Rows("crossing-5v2o", f"{_EXPERT}, trained for crossing obstacles", tasks=("5v2o-crossing",)),
+    Rows("paper-plain", "the paper's method as published"),
+    Rows("ddpg", "reinforcement learning alone"),
+    Rows("flock", "motion channels, imitation of an expert"),
     Rows("olfati-saber"),
     Rows("orca"),
     Rows("random", filters=("off",)),
@@ -74,13 +57,13 @@ ROWS = (
 )
 """The rows of the tables: each name is a shipped policy's or a controller's."""
 
-SHOWN = "ddpg-5v2o"
+SHOWN = "flock"
 """The policy of the figures of one episode and of the sensor errors."""
 
-ANY_SIZE = "general"
+ANY_SIZE = "flock"
 """The policy that is evaluated with many flock sizes."""
 
-CURVES = ("ddpg-3v1o", "ddpg-5v1o", "ddpg-5v2o")
+CURVES = ("paper-plain", "ddpg", "flock")
 """The policies whose training curves are drawn."""
 
 FLOCK_SIZES = (1, 2, 3, 5, 8, 12, 20, 50, 200)
@@ -195,30 +178,30 @@ def _rows(tables: dict[str, Any], task: str, policies: Mapping[str, LoadedPolicy
             continue
         label = f"`{rows.name}`" + (f" ({rows.note})" if rows.note else "")
         if rows.name in policies:
-            medians += _median(label, rows.name, policies[rows.name].scenario, scenario)
+            medians.append(_over_trainings(label, task, read_card(rows.name)))
         tables[task][rows.name] = found = _evaluate(rows, policies, scenario, episodes)
         evaluated += [_row(label, f"`{safety_filter}`", metrics) for safety_filter, metrics in found.items()]
     return medians + evaluated
 
 
-def _median(label: str, name: str, trained_for: Scenario, scenario: Scenario) -> list[str]:
-    """A row with the median over the trainings of a policy, if there are several, and they were for this task."""
-    card = read_card(name)
-    bodies = ("n_vehicles", "n_obstacles", "obstacle_motion")
-    if len(card["seeds"]) == 1 or any(getattr(trained_for, field) != getattr(scenario, field) for field in bodies):
-        return []
-    label += f", median of {len(card['seeds'])} trainings, from the model card"
-    return [_row(label, f"`{trained_for.safety_filter}`", _without_intervals(median_of_seeds(card)))]
+def _over_trainings(label: str, task: str, card: Mapping[str, Any]) -> str:
+    """A row with the median over the trainings of a policy, and the lowest and the highest."""
+    label += f", median (range) of {len(card['seeds'])} trainings, from the model card"
+    scenario = card["config"]["scenario"]
+    return _row(label, f"`{scenario['safety_filter']}`", over_seeds(card, task), ranges=True)
 
 
 def _evaluate(
     rows: Rows, policies: Mapping[str, LoadedPolicy], scenario: Scenario, episodes: int
 ) -> dict[str, dict[str, Metric]]:
-    """The metrics by safety filter; none for a controller whose library is not installed."""
+    """The metrics by safety filter; none for a controller whose library is not installed.
+
+    A policy flies its own scenario, with what it was trained to observe, with the bodies of the task.
+    """
     controller: LoadedPolicy | Controller
     if rows.name in policies:
         controller = policies[rows.name]
-        scenario = scenario.replace(motion_lag=controller.scenario.motion_lag)
+        scenario = with_bodies_of(controller.scenario, scenario)
     else:
         try:
             controller = make_controller(rows.name)
@@ -236,18 +219,24 @@ def _without_intervals(means: Mapping[str, float]) -> dict[str, Metric]:
     return {name: Metric(mean, None, None, 0) for name, mean in means.items()}
 
 
-def _row(label: str, safety_filter: str, metrics: Mapping[str, Metric]) -> str:
-    cells = [_cell(METRICS[name], metrics.get(name)) for name in COLUMNS.values()]
+def _row(label: str, safety_filter: str, metrics: Mapping[str, Metric], ranges: bool = False) -> str:
+    """:param ranges: show the interval of every metric, not of the binary ones alone"""
+    kinds = [METRICS[name] for name in COLUMNS.values()]
+    cells = [_cell(kind, metrics.get(kind.name), ranges or kind.is_binary) for kind in kinds]
     return f"| {label} | {safety_filter} | " + " | ".join(cells) + " |"
 
 
-def _cell(kind: type[EpisodeMetric], metric: Metric | None) -> str:
+def _cell(kind: type[EpisodeMetric], metric: Metric | None, has_interval: bool) -> str:
     if metric is None or metric.mean is None:
         return ""
-    if not kind.is_binary:
-        return f"{100 * metric.mean:.2f} %" if kind.is_rate else f"{metric.mean:.3f}"
-    interval = "" if metric.low is None or metric.high is None else f" ({100 * metric.low:.1f} to {100 * metric.high:.1f})"
-    return f"{100 * metric.mean:.1f} %{interval}"
+
+    def number(value: float) -> str:
+        return f"{value:.3f}" if not kind.is_rate else f"{100 * value:.{1 if kind.is_binary else 2}f}"
+
+    interval = ""
+    if has_interval and metric.low is not None and metric.high is not None:
+        interval = f" ({number(metric.low)} to {number(metric.high)})"
+    return f"{number(metric.mean)}{' %' if kind.is_rate else ''}{interval}"
 
 
 def _episode_figures(folder: Path, policy: LoadedPolicy) -> str:
@@ -260,19 +249,18 @@ def _episode_figures(folder: Path, policy: LoadedPolicy) -> str:
 
 
 def _training_curve(folder: Path, policies: Mapping[str, LoadedPolicy]) -> str:
-    """The return of the evaluations during the trainings of the model cards, against flock episodes of the training env."""
+    """The tracking error of the evaluations during the trainings of the model cards, against transitions."""
     series = {}
     for name in CURVES:
-        seeds, config = read_card(name)["seeds"], policies[name].config
-        flock = config.training_scenarios()[0]
-        episodes = np.array(seeds[0]["curve"]["timesteps"]) / (flock.n_vehicles * flock.max_cycles)
-        returns = np.array([seed["curve"]["return"] for seed in seeds])
-        series[config.scenario.bodies] = (episodes, returns)
-    save(plot_lines(series, "flock episodes in training", "return of a vehicle, 100 episodes"), folder / "training")
+        curves = [seed["curve"] for seed in read_card(name)["seeds"]]
+        series[name] = (np.array(curves[0]["timesteps"]), np.array([curve["tracking_error"] for curve in curves]))
+    save(plot_lines(series, "transitions", "tracking error [m]"), folder / "training")
+    bodies = {policies[name].scenario.bodies for name in CURVES}
     return (
-        "## Training curves\n\n![return against episodes](training.png)\n\n"
-        f"The trainings of {', '.join(f'`{name}`' for name in CURVES)}: the line is the median over the trainings, the "
-        "shade covers all of them. The paper's policy was stable after about 10 000 episodes."
+        "## Training curves\n\n![tracking error against transitions](training.png)\n\n"
+        f"The trainings of {', '.join(f'`{name}`' for name in CURVES)}, evaluated on {' and '.join(sorted(bodies))}: the line "
+        "is the median over the trainings, the shade covers all of them. A transition is one step of one vehicle. The paper's "
+        "policy was stable after about 10 000 episodes, of a length that it does not state."
     )
 
 

@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from sb3_flock._renamed import POLICIES, warn_renamed
+from sb3_flock._renamed import current_policy
 from sb3_flock.cli.parsing import Parser, listed
 from sb3_flock.errors import SettingsError
 from sb3_flock.settings import suggest
@@ -45,9 +45,7 @@ def run(options: argparse.Namespace, words: Sequence[str]) -> int:
 def _known(name: str) -> str:
     from sb3_flock.pretrained import shipped_policies
 
-    if name in POLICIES:
-        warn_renamed(f"policy {name}", POLICIES[name])
-        name = POLICIES[name]
+    name = current_policy(name)
     names = shipped_policies()
     if name not in names:
         raise SettingsError(f"{name}: not a shipped policy{suggest(name, names)}; there are {listed(names)}")
@@ -77,9 +75,9 @@ def _list() -> Table:
 
 def _config(card: Mapping[str, Any]) -> TrainingConfig:
     from sb3_flock.config.training import TrainingConfig
-    from sb3_flock.serialization.migrate import FORMAT, migrate_config
+    from sb3_flock.serialization.migrate import migrate_config
 
-    return TrainingConfig(**migrate_config(TrainingConfig, card["config"], FORMAT)[0])
+    return TrainingConfig(**migrate_config(TrainingConfig, card["config"], card.get("format", 3))[0])
 
 
 def _shipped(card: Mapping[str, Any]) -> dict[str, Any]:
@@ -103,8 +101,8 @@ def _method(config: TrainingConfig) -> tuple[str, str]:
 
 def _print_card(name: str, console: Any) -> None:
     from sb3_flock.evaluation.metrics import METRICS
-    from sb3_flock.evaluation.model_cards import median_of_seeds, read_card
-    from sb3_flock.evaluation.report import plain_table
+    from sb3_flock.evaluation.model_cards import over_seeds, read_card
+    from sb3_flock.evaluation.report import add_short_columns, plain_table, short_cells
     from sb3_flock.pretrained import shipped_policies
 
     card = read_card(name)
@@ -132,9 +130,25 @@ def _print_card(name: str, console: Any) -> None:
     table.add_column("metric", no_wrap=True)
     table.add_column("policy", justify="right", no_wrap=True)
     table.add_column(f"median of {number}", justify="right", no_wrap=True)
-    medians = median_of_seeds(card)
+    table.add_column("range", justify="right", no_wrap=True)
+    trainings = over_seeds(card)
     for metric, kind in METRICS.items():
-        values = [values.get(metric) for values in (shipped["metrics"], medians)]
-        table.add_row(metric, *("-" if value is None else kind.format(value) for value in values))
+        value, over = shipped["metrics"].get(metric), trainings.get(metric)
+        cells = ["-" if value is None else kind.format(value), "-", "-"]
+        if over is not None:
+            assert over.mean is not None
+            assert over.low is not None
+            assert over.high is not None
+            cells[1:] = kind.format(over.mean), f"{kind.format(over.low)} to {kind.format(over.high)}"
+        table.add_row(metric, *cells)
     console.print(f"Results on {card['episodes']} episodes of the task:")
     console.print(table)
+    if "tasks" in shipped:
+        table = plain_table(gap=1)
+        table.add_column("task", no_wrap=True)
+        add_short_columns(table)
+        for task in shipped["tasks"]:
+            medians = {metric: over.mean for metric, over in over_seeds(card, task).items()}
+            table.add_row(task, *short_cells(medians))
+        console.print(f"Medians of the {number} trainings on {card['episodes']} episodes of each task:")
+        console.print(table)

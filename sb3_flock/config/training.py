@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated
+from collections.abc import Mapping
+from typing import Annotated, Any
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from sb3_flock.controllers import EXPERTS
 from sb3_flock.controllers.mpc import MPCConfig
@@ -15,6 +16,10 @@ from sb3_flock.settings import NotNegative, Positive, Settings, suggest
 from sb3_flock.sim import Scenario
 from sb3_flock.sim.dynamics import MAX_BODIES, ObstacleMotion
 
+TRAINING_TASK: dict[str, Any] = {"safety_filter": "announce", "shared_detections": True}
+"""What a training's task has, unless it says otherwise, in place of the defaults of :class:`~sb3_flock.sim.Scenario`, which are
+the paper's."""
+
 Sizes = Annotated[tuple[Width, ...], BeforeValidator(lambda value: (value,) if isinstance(value, int) else value)]
 """One or several; a number alone is one."""
 
@@ -23,15 +28,15 @@ class TrainEnvConfig(Settings):
     """How the training env differs from the task. The task itself, on which policies are evaluated, never changes.
 
     With the paper's random walk an obstacle seldom meets the flock, and a policy that keeps exactly the minimum separation
-    violates it at the slightest error: the training env is harder than the task. In a large flock every vehicle's exploration
-    disturbs all others, and policies learn packs that are loose enough to tolerate it; in a small one too few encounters
-    happen: the default is a flock of four. The effect of one action over a tenth of a second is small beside the noise of the
-    value estimates: the training env's time step is longer, and ``algorithm.gamma`` counts these longer steps. A policy that
-    explores seldom visits dense packs at rest, and learns to avoid them: an expert demonstrates them.
+    violates it at the slightest error: the obstacles' square is smaller and the separations are wider than the task's. In a
+    large flock every vehicle's exploration disturbs all others; in a small one vehicles meet too seldom: the default is a flock
+    of five. The effect of one action over a tenth of a second is small beside the noise of the value estimates: an action is
+    repeated, and ``algorithm.gamma`` counts the longer steps. A policy that explores seldom visits dense packs at rest, and
+    learns to avoid them: an expert demonstrates them.
     """
 
     flock_sizes: Sizes | None = Field(
-        (4,),
+        (5,),
         min_length=1,
         max_length=16,
         description="vehicles per flock, one or several sizes; null: as in the task (paper: null)",
@@ -42,15 +47,15 @@ class TrainEnvConfig(Settings):
         max_length=2,
         description="motions of the obstacles, each with flocks of its own; null: as in the task (paper: null)",
     )
-    extra_obstacles: int = Field(1, ge=0, le=MAX_BODIES, description="obstacles added if the task has any (paper: 0)")
+    extra_obstacles: int = Field(0, ge=0, le=MAX_BODIES, description="obstacles added if the task has any (paper: 0)")
     obstacle_arena_scale: Positive = Field(
         0.5, description="factor on the square of obstacles that walk, unless obstacle_starts is set (paper: 1)"
     )
-    time_step_scale: Positive = Field(2.0, description="factor on the sampling period (paper: 1)")
-    action_repeat: int = Field(1, ge=1, le=1000, description="sampling periods for which an action is repeated (paper: 1)")
-    separation_scale: float = Field(1.06, ge=1, le=1e6, description="factor on the minimum separations (paper: 1)")
+    time_step_scale: Positive = Field(1.0, description="factor on the sampling period (paper: 1)")
+    action_repeat: int = Field(2, ge=1, le=1000, description="sampling periods for which an action is repeated (paper: 1)")
+    separation_scale: float = Field(1.03, ge=1, le=1e6, description="factor on the minimum separations (paper: 1)")
     obstacle_separation_scale: float | None = Field(
-        None, ge=1, le=1e6, description="the same for obstacles; null: separation_scale (paper: 1)"
+        1.08, ge=1, le=1e6, description="the same for obstacles; null: separation_scale (paper: 1)"
     )
     expert: str | None = Field(
         None,
@@ -77,10 +82,19 @@ class TrainEnvConfig(Settings):
 class TaskConfig(Settings):
     """The task, and how the training env differs from it."""
 
-    scenario: Scenario = Field(default_factory=Scenario, description="the task, on which policies are evaluated")
+    scenario: Scenario = Field(
+        default_factory=lambda: Scenario(**TRAINING_TASK),
+        description="the task, on which policies are evaluated; with the safety filter and shared detections unless it says "
+        "otherwise",
+    )
     train_env: TrainEnvConfig = Field(
         default_factory=TrainEnvConfig, description="how the training env differs from the task"
     )
+
+    @field_validator("scenario", mode="before")
+    @classmethod
+    def _has_a_filter(cls, value: Any) -> Any:
+        return {**TRAINING_TASK, **value} if isinstance(value, Mapping) else value
 
     @model_validator(mode="after")
     def _lag_fits_the_training_env(self) -> TaskConfig:

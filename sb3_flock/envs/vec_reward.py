@@ -30,7 +30,7 @@ class VecNeighborInclusiveReward(VecEnvWrapper):
         ``VecNormalize`` or in this class already
     """
 
-    def __init__(self, venv: VecEnv, lambda_: float = 0.7, n_agents: int | None = None) -> None:
+    def __init__(self, venv: VecEnv, lambda_: float = 0.4, n_agents: int | None = None) -> None:
         check_share(lambda_)
         for kind in (VecNormalize, VecNeighborInclusiveReward):
             if unwrap_vec_wrapper(venv, kind) is not None:

@@ -16,9 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_flock.config.training import TrainingConfig
+from sb3_flock.evaluation.metrics import Metric
 from sb3_flock.evaluation.rollout import evaluate
+from sb3_flock.evaluation.tasks import TASKS, with_bodies_of
 from sb3_flock.pretrained import shipped_policies
-from sb3_flock.serialization.migrate import MEMBER
+from sb3_flock.serialization.migrate import FORMAT, MEMBER
+from sb3_flock.sim import Scenario
 
 CHECK_EPISODES, CHECK_SEED = 50, 7
 """The short evaluation whose tracking error a card records. The tests repeat it with every later version."""
@@ -30,11 +33,18 @@ def read_card(name: str) -> dict[str, Any]:
     return card
 
 
-def median_of_seeds(card: dict[str, Any]) -> dict[str, float]:
-    """The median of each metric that is recorded of all trainings."""
-    seeds = [seed["metrics"] for seed in card["seeds"]]
+def over_seeds(card: Mapping[str, Any], task: str | None = None) -> dict[str, Metric]:
+    """Each metric that all trainings have: the median over them, the lowest and the highest.
+
+    :param task: one of :data:`~sb3_flock.evaluation.tasks.TASKS`; otherwise the one that the policy was trained for
+    """
+    seeds = [seed["metrics"] if task is None else seed["tasks"][task] for seed in card["seeds"]]
     columns = {name: [metrics.get(name) for metrics in seeds] for name in seeds[0]}
-    return {name: float(np.median(values)) for name, values in columns.items() if None not in values}
+    return {
+        name: Metric(float(np.median(values)), min(values), max(values), len(values))
+        for name, values in columns.items()
+        if None not in values
+    }
 
 
 def ship(name: str, runs: Sequence[str | Path], folder: str | Path, episodes: int = 1000) -> Path:
@@ -59,6 +69,7 @@ def ship(name: str, runs: Sequence[str | Path], folder: str | Path, episodes: in
     check = evaluate(shipped, episodes=CHECK_EPISODES, seed=CHECK_SEED)["tracking_error"].mean
     scenario = shipped.scenario
     card = {
+        "format": FORMAT,
         "name": name,
         "task": f"{scenario.bodies} ({scenario.obstacle_motion})",
         "shipped_seed": shipped.config.seed,
@@ -77,13 +88,18 @@ def _record(run: Path, history: Mapping[str, NDArray[np.float64]], episodes: int
     from sb3_flock.serialization.load import load_policy
 
     policy = load_policy(run)
-    metrics = evaluate(policy, episodes=episodes, seed=0)
+
+    def measure(scenario: Scenario) -> dict[str, float | None]:
+        metrics = evaluate(policy, scenario, episodes, seed=0)
+        return {key: None if metric.mean is None else round(metric.mean, 5) for key, metric in metrics.items()}
+
     return {
         "seed": policy.config.seed,
         "command": (run / "command.txt").read_text(encoding="utf-8").strip(),
         "transitions": int(history["timesteps"][-1]),
         "minutes": round(float(history["seconds"][-1]) / 60, 1),
-        "metrics": {key: None if metric.mean is None else round(metric.mean, 5) for key, metric in metrics.items()},
+        "metrics": measure(policy.scenario),
+        "tasks": {name: measure(with_bodies_of(policy.scenario, task)) for name, task in TASKS.items()},
         "curve": {key: history[key].round(4).tolist() for key in ("timesteps", "return", "tracking_error")},
     }
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from sb3_flock._renamed import POLICIES, warn_renamed
+from sb3_flock._renamed import current_policy
 from sb3_flock.settings import SettingsError, suggest
 
 
@@ -18,9 +18,7 @@ def policy_path(name: str) -> Path:
 
     :raises SettingsError: for another name
     """
-    if name in POLICIES:
-        warn_renamed(f"policy {name}", POLICIES[name])
-        name = POLICIES[name]
+    name = current_policy(name)
     shipped = shipped_policies()
     if name not in shipped:
         raise SettingsError(f"policy = {name!r}: one of {', '.join(shipped)} is needed{suggest(name, shipped)}")

@@ -47,7 +47,7 @@ class NeighborInclusiveReward(BaseCallback):
         off-policy algorithm's env is wrapped in ``VecNormalize``, or if the rewards would be mixed twice
     """
 
-    def __init__(self, lambda_: float = 0.7, n_agents: int | None = None, verbose: int = 0) -> None:
+    def __init__(self, lambda_: float = 0.4, n_agents: int | None = None, verbose: int = 0) -> None:
         super().__init__(verbose)
         check_share(lambda_)
         self.lambda_ = lambda_

@@ -25,18 +25,22 @@ from stable_baselines3.common.utils import get_device
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_wrapper
 from torch import nn
 
-from sb3_flock._renamed import POLICIES, warn_renamed
+from sb3_flock._renamed import current_policy
 from sb3_flock.config.training import TrainingConfig
 from sb3_flock.envs.flocking_v0 import action_space, observation_space
 from sb3_flock.pretrained import shipped_policies
 from sb3_flock.rl.ddpg import FlockDDPG
 from sb3_flock.rl.registry import ALGORITHMS, build_model, fewest_parameters, policy_kwargs
-from sb3_flock.serialization.migrate import FORMAT, MEMBER, check_format, migrate_config, migrate_weights
+from sb3_flock.serialization.migrate import MEMBER, check_format, migrate_config, migrate_weights
 from sb3_flock.serialization.yaml_io import load_config
 from sb3_flock.settings import SettingsError, UserError
 from sb3_flock.sim import Scenario, check_actions
 
 _CHECKPOINT = re.compile(r"rl_model_(\d+)_steps\.zip")
+
+
+_UNFILTERED = 3
+"""The format as which files that SB3 alone saved are read: up to it, tasks have no safety filter unless they say so."""
 
 
 class PolicyError(UserError):
@@ -175,9 +179,8 @@ def find_policy(path: str | Path) -> Path:
 
     :raises PolicyError: if there is none
     """
-    if str(path) in POLICIES and not Path(path).exists():
-        warn_renamed(f"policy {path}", POLICIES[str(path)], stacklevel=3)
-        path = POLICIES[str(path)]
+    if not Path(path).exists():
+        path = current_policy(str(path), stacklevel=3)
     shipped = shipped_policies().get(str(path))
     path = Path(path)
     if shipped is not None and not path.exists():
@@ -215,7 +218,7 @@ def load_policy(path: str | Path, device: str = "cpu", trust: bool = False) -> L
     except _UnknownPartsError as error:
         if not trust:
             raise PolicyError(f"{path}: {error}; with trust, SB3 loads it and runs any code in it") from None
-        has_member, member, weights = False, {"format": FORMAT, "config": {}}, {}
+        has_member, member, weights = False, {"format": _UNFILTERED, "config": {}}, {}
     except Exception as error:  # zipfile, json and torch raise many kinds for a damaged file; all mean the same here
         raise PolicyError(f"{path}: damaged or not a policy file ({first_line(error)})") from None
     try:
@@ -363,7 +366,7 @@ def _describe_plain_file(archive: zipfile.ZipFile) -> dict[str, Any]:
     except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
         why = f"not a policy of sb3_flock, nor one of DDPG or TD3 with FlockCNN ({first_line(error)})"
         raise _UnknownPartsError(why) from None
-    return {"format": FORMAT, "config": config}
+    return {"format": _UNFILTERED, "config": config}
 
 
 def _observation_fields(channels: int, n_anchors: int, _: int) -> dict[str, Any]:

@@ -1,7 +1,8 @@
 """Every earlier format of our files, read into the present one.
 
 Zips, checkpoints and whole configs carry a format number. Format 1 flattened the features channel by channel, format 2 anchor
-by anchor; format 3 renamed fields, values and modules (:mod:`sb3_flock._renamed`).
+by anchor; format 3 renamed fields, values and modules (:mod:`sb3_flock._renamed`); with format 4 the task of a training has
+the safety filter unless it says otherwise.
 The module is importable without torch.
 """
 
@@ -16,7 +17,7 @@ import numpy as np
 from sb3_flock._renamed import rename_fields
 from sb3_flock.settings import Settings, SettingsError, format_value, group_of
 
-FORMAT = 3
+FORMAT = 4
 """The format that this version writes."""
 
 MEMBER = "flock.json"
@@ -45,6 +46,8 @@ def migrate_config(
     current, renamed = _rename(settings, _without_max_vehicles(values), "")
     if number < 3 or renamed:
         _drop_idle_options(current)
+    if number < 4:
+        _fill_in(settings, current)
     return current, renamed
 
 
@@ -74,6 +77,19 @@ def _without_max_vehicles(values: Mapping[str, Any]) -> Mapping[str, Any]:
     sizes = (min(n_vehicles, practice["max_vehicles"]),)
     learner = {"mirror": False, **values.get("learner", {})}
     return {**values, "practice": {**then, **others, "vehicles": sizes}, "learner": learner}
+
+
+_BEFORE_FORMAT_4: dict[str, dict[str, Any]] = {
+    "scenario": {"safety_filter": "off", "shared_detections": False},
+    "train_env": {"action_repeat": 1},
+}
+"""By group: fields that files of earlier formats, which are whole, leave out where they did not exist yet, and their values then."""
+
+
+def _fill_in(settings: type[Settings], values: dict[str, Any]) -> None:
+    for group, then in _BEFORE_FORMAT_4.items():
+        if group in settings.model_fields and isinstance(values.get(group, {}), Mapping):
+            values[group] = {**then, **values.get(group, {})}
 
 
 def _drop_idle_options(values: dict[str, Any]) -> None:

@@ -125,7 +125,7 @@ def _with_numbers_of(data: Mapping[str, Any], fresh: dict[str, Any]) -> bytes:
 
 
 def _card(path: Path) -> bytes | None:
-    """The same for a model card: its name and its config."""
+    """The same for a model card: its config."""
     try:
         text = path.read_text(encoding="utf-8")
         card = json.loads(text)
@@ -133,14 +133,15 @@ def _card(path: Path) -> bytes | None:
         raise SettingsError(f"{path}: not a JSON file ({first_line(error)})") from None
     if not isinstance(card, dict) or not isinstance(card.get("config"), dict) or "seeds" not in card:
         raise SettingsError(f"{path}: not a model card (it has no config and seeds)")
-    values, renamed = migrate_config(TrainingConfig, card["config"], FORMAT)
-    name = card.get("name")
-    current = POLICIES.get(name, name) if isinstance(name, str) else name
-    if not renamed and current == name:
+    number = card.get("format", 3)  # the first cards had none
+    with _errors_of(path):
+        values, renamed = migrate_config(TrainingConfig, card["config"], check_format(number))
+    if number == FORMAT and not renamed:
         return None
     with _errors_of(path):
         config = TrainingConfig(**values).model_dump(mode="json")
-    return (json.dumps({**card, "name": current, "config": config}, indent=1) + "\n").encode()
+    migrated = {**card, "format": FORMAT, "config": config}
+    return (json.dumps(migrated, indent=1) + "\n").encode()
 
 
 # -- configs -----------------------------------------------------------------------------------------------------------

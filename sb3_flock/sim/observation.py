@@ -45,7 +45,7 @@ def _neighbor_radius(settings: ObservationSettings) -> float:
 
 
 def _obstacle_radius(settings: ObservationSettings) -> float:
-    return settings.detection_range if settings.obstacle_radius is None else settings.obstacle_radius
+    return settings.known_obstacle_range if settings.obstacle_radius is None else settings.obstacle_radius
 
 
 CHANNELS = {
@@ -76,7 +76,9 @@ class ObservationSettings(SensingSettings, SensorSettings):
         None, description="half width of the neighbor channel r_c [m]; null: link_range (paper: not stated)"
     )
     obstacle_radius: Positive | None = Field(
-        None, description="half width of the obstacle channel [m]; null: detection_range (paper: null)"
+        None,
+        description="half width of the obstacle channel [m]; null: detection_range, plus link_range with shared_detections "
+        "(paper: null)",
     )
     goal_radius: Positive = Field(
         0.3,

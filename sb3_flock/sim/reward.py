@@ -49,7 +49,7 @@ def register_reward_term(name: str) -> Callable[[RewardTerm], RewardTerm]:
 class RewardWeights(Settings):
     """The weights of the reward. The paper's plain sum is in ``configs/paper_plain.yaml``: weights of 1."""
 
-    link_bonus: NotNegative = Field(0.5, description="reward for each neighbor at a safe distance (paper: 1)")
+    link_bonus: NotNegative = Field(1.0, description="reward for each neighbor at a safe distance (paper: 1)")
     separation_penalty: NotNegative = Field(
         6.0, description="penalty for each neighbor nearer than neighbor_separation (paper: 1)"
     )
@@ -64,7 +64,7 @@ class RewardWeights(Settings):
         -0.02, ge=-1e6, le=0, description="weight of the squared action [m/s, rad/s], not positive (paper: not stated)"
     )
     lambda_: float = Field(
-        0.7, ge=0, le=1, description="share of a vehicle's own reward in the mix with its neighbors' (paper: not stated)"
+        0.4, ge=0, le=1, description="share of a vehicle's own reward in the mix with its neighbors' (paper: not stated)"
     )
     scale: Positive = Field(0.02, description="factor on the sum of the terms (paper: 1)")
     extra_terms: dict[str, float] = Field({}, description="weights of further registered terms by name (paper: none)")

@@ -70,7 +70,7 @@ class SafetySettings(SensingSettings, SensorSettings):
         if getattr(self, sensing_range) < (1 + 2 * ROUNDING) * kept + approach:
             raise ValueError(
                 f"{sensing_range} = {getattr(self, sensing_range)}: {which} needs more than {separation} + safety_margin + "
-                f"the approach of two bodies in one time_step = {kept:g} + {approach:g}"
+                f"the approach of two bodies in one time_step = {kept:g} + {approach:g}; it can be off"
             )
 
     @property
