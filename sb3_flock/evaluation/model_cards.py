@@ -88,18 +88,18 @@ def _record(run: Path, history: Mapping[str, NDArray[np.float64]], episodes: int
     from sb3_flock.serialization.load import load_policy
 
     policy = load_policy(run)
-
-    def measure(scenario: Scenario) -> dict[str, float | None]:
-        metrics = evaluate(policy, scenario, episodes, seed=0)
-        return {key: None if metric.mean is None else round(metric.mean, 5) for key, metric in metrics.items()}
-
+    tasks = {name: with_bodies_of(policy.scenario, task) for name, task in TASKS.items()}
+    metrics: dict[Scenario, dict[str, float | None]] = {}
+    for scenario in {policy.scenario, *tasks.values()}:
+        means = evaluate(policy, scenario, episodes, seed=0)
+        metrics[scenario] = {key: None if value.mean is None else round(value.mean, 5) for key, value in means.items()}
     return {
         "seed": policy.config.seed,
         "command": (run / "command.txt").read_text(encoding="utf-8").strip(),
         "transitions": int(history["timesteps"][-1]),
         "minutes": round(float(history["seconds"][-1]) / 60, 1),
-        "metrics": measure(policy.scenario),
-        "tasks": {name: measure(with_bodies_of(policy.scenario, task)) for name, task in TASKS.items()},
+        "metrics": metrics[policy.scenario],
+        "tasks": {name: metrics[scenario] for name, scenario in tasks.items()},
         "curve": {key: history[key].round(4).tolist() for key in ("timesteps", "return", "tracking_error")},
     }
 
