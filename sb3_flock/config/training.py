@@ -53,7 +53,7 @@ class TrainEnvConfig(Settings):
     )
     time_step_scale: Positive = Field(1.0, description="factor on the sampling period (paper: 1)")
     action_repeat: int = Field(2, ge=1, le=1000, description="sampling periods for which an action is repeated (paper: 1)")
-    separation_scale: float = Field(1.03, ge=1, le=1e6, description="factor on the minimum separations (paper: 1)")
+    separation_scale: float = Field(1.02, ge=1, le=1e6, description="factor on the minimum separations (paper: 1)")
     obstacle_separation_scale: float | None = Field(
         1.08, ge=1, le=1e6, description="the same for obstacles; null: separation_scale (paper: 1)"
     )
@@ -145,7 +145,7 @@ class TrainingConfig(ModelSettings, TaskConfig):
     :raises SettingsError: one line naming the parameter, its value and what is accepted
     """
 
-    total_timesteps: int = Field(300_000, ge=1, le=10**12, description="transitions to train for")
+    total_timesteps: int = Field(400_000, ge=1, le=10**12, description="transitions to train for")
     n_flocks: Width = Field(32, description="flocks in the training env, of each flock size")
     num_cpus: int = Field(
         0, ge=0, le=1024, description="SuperSuit worker processes; 0: simulate in the training process, which is faster"
