@@ -1,7 +1,7 @@
 """sb3_flock: multi-vehicle flocking by reinforcement learning, as a Stable-Baselines3 plugin.
 
 The public names below are imported when they are first used, so that importing the package is quick. Importing it registers
-the environment with PettingZoo as ``flock/flocking-v0``.
+the environment with PettingZoo as ``flock/flocking-v0`` and with Gymnasium as ``sb3_flock/Flocking-v0``.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+import gymnasium
 import pettingzoo
 
 from sb3_flock import _renamed
@@ -129,3 +130,5 @@ _renamed.install()
 if "flock/flocking-v0" not in pettingzoo.parallel_registry:
     pettingzoo.register("parallel", "flock/flocking-v0", entry_point="sb3_flock.envs.flocking_v0:parallel_env")
     pettingzoo.register("aec", "flock/flocking-v0", entry_point="sb3_flock.envs.flocking_v0:env")
+if "sb3_flock/Flocking-v0" not in gymnasium.registry:
+    gymnasium.register("sb3_flock/Flocking-v0", entry_point="sb3_flock.envs.gym_env:FlockEnv")
