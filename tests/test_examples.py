@@ -51,6 +51,16 @@ def test_a_policy_and_a_baseline_controller_on_the_same_episodes(tmp_path):
     assert (tmp_path / "beside_olfati_saber.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_a_training_in_weights_and_biases_without_a_network(tmp_path, monkeypatch):
+    for name, value in {"WANDB_MODE": "offline", "WANDB_SILENT": "true", "WANDB_DIR": str(tmp_path)}.items():
+        monkeypatch.setenv(name, value)
+    assert "best_model.zip is an artifact of the run " in run("track_with_wandb.py", 1000, cwd=tmp_path)
+    (folder,) = (tmp_path / "wandb").glob("offline-run-*")
+    stored = next(folder.glob("*.wandb")).read_bytes()
+    for name in (b"eval/tracking_error", b"separation_penalty", b"best_model.zip"):
+        assert name in stored
+
+
 def test_parameter_sharing(tmp_path):
     output = run("parameter_sharing.py", cwd=tmp_path)
     assert "computed alone, the same: True" in output
