@@ -257,7 +257,7 @@ def test_numbers_near_0_and_1_stay_in_the_graph():
 
 @pytest.fixture(scope="module")
 def policy():
-    return load_policy("ddpg-bc-3v1o")
+    return load_policy("flock")
 
 
 @pytest.fixture(scope="module", params=["motion", "announce"])
@@ -386,7 +386,7 @@ def fly_as_the_world_does(session, scenario, policy):
 
 
 def test_the_bounds_of_another_scenario_are_kept(tmp_path):
-    policy = load_policy("ddpg-3v1o")
+    policy = load_policy("ddpg")
     with pytest.warns(UserWarning, match="max_speed = 0.15, evaluated with 0.05"):
         done = export(policy, tmp_path / "slow.onnx", 20, scenario=policy.scenario.replace(max_speed=0.05))
     assert done.difference < TOLERANCE
@@ -395,7 +395,7 @@ def test_the_bounds_of_another_scenario_are_kept(tmp_path):
 def test_mistakes_are_one_line(policy, tmp_path):
     path = tmp_path / "policy.onnx"
     with pytest.raises(SettingsError, match="safety_filter = motion: motion_lag > 0 is needed"):
-        export(load_policy("ddpg-3v1o"), path, scenario=load_policy("ddpg-3v1o").scenario.replace(safety_filter="motion"))
+        export(load_policy("ddpg"), path, scenario=load_policy("ddpg").scenario.replace(safety_filter="motion"))
     with pytest.raises(PolicyError, match="its observations have the shape"):
         export(policy, path, scenario=policy.scenario.replace(motion_lag=0.0, safety_filter="voronoi"))
     assert not path.exists()

@@ -72,7 +72,7 @@ def refresh(controller, now):
 
 
 @pytest.mark.parametrize("level", LEVELS)
-@pytest.mark.parametrize("name", ["ddpg-bc-5v2o", "crossing-5v2o"])
+@pytest.mark.parametrize("name", ["ddpg", "flock"])
 def test_commands_are_those_of_the_world(name, level):
     policy = load_policy(name)
     scenario = policy.scenario.replace(safety_filter=level, arena=0.4)
@@ -80,7 +80,7 @@ def test_commands_are_those_of_the_world(name, level):
 
 
 def test_commands_are_those_of_the_world_with_shared_detections_and_a_filter_of_obstacles():
-    policy = load_policy("ddpg-5v2o")
+    policy = load_policy("ddpg")
     scenario = policy.scenario.replace(
         safety_filter="announce", obstacle_filter=True, shared_detections=True, arena=0.5, n_vehicles=7, n_obstacles=4
     )
@@ -185,7 +185,7 @@ def test_a_command_that_is_not_finite_is_an_error():
 
 
 def test_after_a_stop_motion_channels_start_anew():
-    policy = load_policy("ddpg-bc-5v2o")
+    policy = load_policy("flock")
     world = World(policy.scenario)
     world.reset([episode_rng(0, 0)])
     fresh, used = (VehicleController(policy, policy.scenario, 0, TIMEOUT) for _ in range(2))

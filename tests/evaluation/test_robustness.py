@@ -12,7 +12,7 @@ SMALL = Scenario(max_cycles=100)
 
 @pytest.fixture(scope="module")
 def rows():
-    return evaluate_with_errors(load_policy("ddpg-3v1o"), SMALL, episodes=20)
+    return evaluate_with_errors(load_policy("ddpg"), SMALL, episodes=20)
 
 
 def test_a_policy_tracks_worse_with_much_noise_than_with_none(rows):

@@ -301,7 +301,7 @@ def test_loading_and_evaluating_imports_neither_torchs_compiler_nor_what_trains_
     code = """
 import sys
 from sb3_flock import evaluate, load_policy
-policy = load_policy("ddpg-3v1o")
+policy = load_policy("ddpg")
 evaluate(policy, policy.scenario.replace(max_cycles=2), episodes=1)
 slow = {"torch._dynamo", "sympy", "matplotlib", "pandas", "supersuit", "onnx", "ray", "sb3_flock.training.train"}
 sys.exit(f"imported: {slow & set(sys.modules)}" if slow & set(sys.modules) else 0)
@@ -323,7 +323,7 @@ def test_a_policy_that_computes_nan_is_refused_in_one_line(saved):
 # -- learning on -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("name", "n_flocks"), [("ddpg-3v1o", 1), ("ddpg-3v1o", 4), ("ddpg-bc-5v2o", 2)])
+@pytest.mark.parametrize(("name", "n_flocks"), [("ddpg", 1), ("ddpg", 4), ("flock", 2)])
 def test_a_shipped_policy_learns_on_with_any_number_of_slots(name, n_flocks):
     policy = load_policy(name)
     env = make_vec_env(policy.scenario.replace(n_vehicles=4), n_flocks, seed=0)
@@ -345,7 +345,7 @@ def test_a_shipped_policy_learns_on_with_any_number_of_slots(name, n_flocks):
 
 
 def test_behavior_cloning_stays_with_an_expert_that_is_queried():
-    policy = load_policy("ddpg-bc-3v1o")
+    policy = load_policy("flock")
     model = policy.to_model(
         expert_vec_env(policy.scenario), learning_starts=12, buffer_size=2000, batch_size=8, learning_rate=1e-5
     )
