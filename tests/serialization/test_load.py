@@ -272,6 +272,9 @@ def test_files_of_plain_sb3_with_our_parts_load_without_trust(tmp_path, algorith
     expected = plain.predict(observations, deterministic=True)[0]
     np.testing.assert_array_equal(loaded.predict(observations)[0], expected)
     np.testing.assert_array_equal(trusted.predict(observations)[0], expected)
+    for read in (loaded, trusted):  # SB3 saves no task: the paper's is assumed, which has no filter
+        assert (read.scenario.safety_filter, read.scenario.shared_detections) == ("off", False)
+        assert read.scenario == Scenario(max_turn_rate=read.scenario.max_turn_rate, max_speed=read.scenario.max_speed)
 
 
 @pytest.mark.parametrize("trust", [False, True])
@@ -367,11 +370,11 @@ def test_what_does_not_fit_the_policy_is_refused_in_one_line(saved, tmp_path):
     with pytest.raises(PolicyError, match="trained without VecNormalize"):
         policy.to_model(VecNormalize(make_vec_env(n_flocks=1)))
     with pytest.raises(SettingsError, match="color is not a parameter"):
-        policy.to_model(make_vec_env(n_flocks=1), color="red")
+        policy.to_model(make_vec_env(policy.scenario, 1), color="red")
     with pytest.raises(SettingsError, match="algo and the networks are those of the file"):
-        policy.to_model(make_vec_env(n_flocks=1), features_dim=32)
+        policy.to_model(make_vec_env(policy.scenario, 1), features_dim=32)
     with pytest.warns(UserWarning, match="link_range = 0.15, evaluated with 0.2"):
-        policy.to_model(make_vec_env(Scenario(link_range=0.2), 1))
+        policy.to_model(make_vec_env(policy.scenario.replace(link_range=0.2), 1))
     plain = tmp_path / "plain.zip"
     DDPG(FlockPolicy, make_vec_env(n_flocks=1), buffer_size=10, device="cpu").save(plain)
     with pytest.warns(UserWarning, match="saved without its scenario"):
