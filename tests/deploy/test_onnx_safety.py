@@ -30,6 +30,8 @@ from sb3_flock.sim import Scenario, World, episode_rng
 from sb3_flock.sim.safety import filter_actions
 from tests.sim.test_safety import DRIVERS, FILTERS, pack, random_task
 
+pytestmark = pytest.mark.filterwarnings("ignore:.*trained with shared_detections")
+
 KNOWN = {"motion": [], "announce": ["neighbor_headings", "neighbor_announced_speeds"]}
 """Inputs of a policy's graph that are there for the filter alone."""
 
@@ -262,8 +264,10 @@ def policy():
 
 @pytest.fixture(scope="module", params=["motion", "announce"])
 def exported(request, policy, tmp_path_factory):
-    """A policy exported with a filter."""
-    scenario = policy.scenario.replace(safety_filter=request.param, obstacle_filter=True, safety_margin=0.002)
+    """A policy exported with a filter, for vehicles that know of the obstacles that they detect themselves."""
+    scenario = policy.scenario.replace(
+        safety_filter=request.param, obstacle_filter=True, safety_margin=0.01, shared_detections=False
+    )
     path = tmp_path_factory.mktemp("onnx") / "policy.onnx"
     if request.param == "motion":
         return scenario, export(policy, path, n_samples=100, scenario=scenario)

@@ -71,12 +71,15 @@ def refresh(controller, now):
         body.receive(body.x, body.y, body.heading, now)
 
 
-@pytest.mark.parametrize("level", LEVELS)
-@pytest.mark.parametrize("name", ["ddpg", "flock"])
+ROUNDING = 5e-5
+"""In float32 a network's turn rate [rad/s] for one vehicle differs so much from the same in a batch."""
+
+
+@pytest.mark.parametrize(("name", "level"), [*(("flock", level) for level in LEVELS), ("ddpg", "announce")])
 def test_commands_are_those_of_the_world(name, level):
     policy = load_policy(name)
     scenario = policy.scenario.replace(safety_filter=level, arena=0.4)
-    assert max(differences(policy, scenario, 60)) < 1e-5
+    assert max(differences(policy, scenario, 60)) < ROUNDING
 
 
 def test_commands_are_those_of_the_world_with_shared_detections_and_a_filter_of_obstacles():
@@ -84,8 +87,13 @@ def test_commands_are_those_of_the_world_with_shared_detections_and_a_filter_of_
     scenario = policy.scenario.replace(
         safety_filter="announce", obstacle_filter=True, shared_detections=True, arena=0.5, n_vehicles=7, n_obstacles=4
     )
+    assert max(differences(policy, scenario, 60)) < ROUNDING
+
+
+def test_commands_are_those_of_the_world_without_shared_detections():
+    policy = load_policy("flock")
     with pytest.warns(UserWarning, match="shared_detections"):
-        assert max(differences(policy, scenario, 60)) < 1e-5
+        assert max(differences(policy, policy.scenario.replace(shared_detections=False, arena=0.5), 60)) < ROUNDING
 
 
 def test_simulated_sensor_errors_are_not_added_to_poses():
