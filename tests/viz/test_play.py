@@ -182,7 +182,8 @@ def test_policies_and_controllers_with_memory_continue_while_the_flock_changes()
         (load_policy("flock"), {"motion_lag": 0.2}),
         (make_controller("orca"), {}),
     ):
-        game = Game(policy, Scenario(n_vehicles=2, n_obstacles=1, **changes))
+        task = getattr(policy, "scenario", Scenario())  # a policy's own, a controller has none
+        game = Game(policy, task.replace(n_vehicles=2, n_obstacles=1, **changes))
         for key in (pygame.K_PLUS, pygame.K_PLUS, pygame.K_v, pygame.K_MINUS):
             press(game, key)
             game.step()
