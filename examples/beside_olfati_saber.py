@@ -5,7 +5,7 @@ import sys
 from sb3_flock import evaluate, load_policy, make_controller
 from sb3_flock.viz.figures import plot_side_by_side, record_trajectory, save_as
 
-policy = load_policy(sys.argv[1] if len(sys.argv) > 1 else "ddpg-5v2o")
+policy = load_policy(sys.argv[1] if len(sys.argv) > 1 else "ddpg")
 episodes = int(sys.argv[2]) if len(sys.argv) > 2 else 200
 controllers = {"ours": policy, "Olfati-Saber": make_controller("olfati-saber")}
 for name, controller in controllers.items():

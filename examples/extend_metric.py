@@ -30,6 +30,6 @@ class ArrivalTime(EpisodeMetric):
 
 
 episodes = int(sys.argv[1]) if len(sys.argv) > 1 else 200
-policy = load_policy("ddpg-3v1o")
-for name, controller in (("ddpg-3v1o", policy), ("orca", make_controller("orca"))):
+policy = load_policy("ddpg")
+for name, controller in (("ddpg", policy), ("orca", make_controller("orca"))):
     print(name, metrics_table(evaluate(controller, policy.scenario, episodes), policy.scenario))

@@ -24,6 +24,6 @@ for agent, info in infos.items():
 steps = int(sys.argv[1]) if len(sys.argv) > 1 else 150_000
 config = TrainingConfig(scenario={"reward": reward}, total_timesteps=steps, n_flocks=8, eval_freq=0)
 trained = load_policy(train(config).folder)
-for name, policy in (("with the term", trained), ("without it, ddpg-3v1o", load_policy("ddpg-3v1o"))):
+for name, policy in (("with the term", trained), ("without it, ddpg", load_policy("ddpg"))):
     separation = evaluate(policy, trained.scenario, episodes=50)["mean_separation_linked"].mean
     print(f"{name}: mean distance of linked vehicles {'none' if separation is None else f'{separation:.4f} m'}")

@@ -1,6 +1,7 @@
-"""One vehicle's own computer: numpy and onnxruntime alone, with a policy from ``sb3-flock export ddpg-5v2o policy.onnx``.
+"""One vehicle's own computer: numpy and onnxruntime alone, with a policy from ``sb3-flock export ddpg -o policy.onnx``.
 
-With ``--set safety_filter=announce`` the exported policy keeps its separation to the neighbors by itself.
+The shipped policies have the safety filter ``announce``: exported with it, a policy keeps the separation to the neighbors by
+itself. With ``--set safety_filter=off`` the file has none.
 
 On a real vehicle the positions come from the radio and the sensors; here a small simulated world of points gives them.
 """

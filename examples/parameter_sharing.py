@@ -7,7 +7,7 @@ from sb3_flock import Scenario, load_policy, make_vec_env
 scenario = Scenario(n_vehicles=3, n_obstacles=1, arena=0.12, obstacle_arena=0.5)  # so small that they start as neighbors
 env = make_vec_env(scenario, n_flocks=2, seed=0)  # 2 flocks of 3 vehicles: 6 slots, flock by flock
 observations = env.reset()
-policy = load_policy("ddpg-3v1o")
+policy = load_policy("ddpg")
 
 actions, _ = policy.predict(observations)  # row s of the actions is computed from row s of the observations alone
 alone = np.concatenate([policy.predict(observations[slot : slot + 1])[0] for slot in range(env.num_envs)])

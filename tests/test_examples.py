@@ -46,7 +46,7 @@ def test_a_custom_extractor_trains(tmp_path):
 
 
 def test_a_policy_and_a_baseline_controller_on_the_same_episodes(tmp_path):
-    output = run("beside_olfati_saber.py", "ddpg-3v1o", 10, cwd=tmp_path)
+    output = run("beside_olfati_saber.py", "ddpg", 10, cwd=tmp_path)
     assert [line.split(":")[0].strip() for line in output.splitlines()] == ["ours", "Olfati-Saber"]
     assert (tmp_path / "beside_olfati_saber.png").read_bytes().startswith(b"\x89PNG")
 
@@ -69,7 +69,7 @@ def test_parameter_sharing(tmp_path):
 
 @pytest.mark.parametrize(
     ("policy", "settings"),
-    [("ddpg-5v2o", []), ("ddpg-bc-5v2o", []), ("ddpg-bc-5v2o", ["--set", "safety_filter=announce"])],
+    [("ddpg", []), ("flock", []), ("flock", ["--set", "safety_filter=off"])],
 )
 def test_the_onboard_example_needs_numpy_and_onnxruntime_alone(tmp_path, policy, settings):
     assert main(["export", policy, "-o", str(tmp_path / "policy.onnx"), *settings]) == 0

@@ -6,7 +6,8 @@ import pytest
 from sb3_flock import reproduce as module
 from sb3_flock.cli import main
 from sb3_flock.controllers import CONTROLLERS
-from sb3_flock.evaluation.model_cards import read_card
+from sb3_flock.evaluation.metrics import METRICS
+from sb3_flock.evaluation.model_cards import over_seeds, read_card
 from sb3_flock.evaluation.report import PAPER
 from sb3_flock.pretrained import shipped_policies
 from sb3_flock.reproduce import (
@@ -76,22 +77,29 @@ def test_every_controller_is_in_every_table_of_its_tasks_with_each_filter(result
     assert page.count("The filter `announce` needs communication") == len(TASKS) + 1  # and one policy with many vehicles
 
 
-def test_a_policy_with_several_trainings_has_their_median_in_the_table_of_its_task(tables):
-    cards = {name: read_card(name) for name in shipped_policies()}
-    expected = [
-        (
-            rows.name,
-            len(cards[rows.name]["seeds"]),
-            f"`{cards[rows.name]['config']['scenario'].get('safety_filter', 'off')}`",
-        )
-        for task, scenario in EXPERIMENTS.items()
-        for rows in ROWS
-        if task in rows.tasks and rows.name in cards and cards[rows.name]["task"] == f"{scenario.bodies} (walk)"
-    ]
-    medians = [row[:2] for row in tables["Tables I and II"] if row[0].endswith(" trainings, from the model card")]
-    words = [(label.split("`")[1], int(re.search(r"median of (\d+)", label)[1]), of) for label, of in medians]
-    assert words == [row for row in expected if row[1] > 1]
-    assert len(words) >= 3
+def test_each_shipped_policy_has_the_median_and_the_range_of_its_trainings_in_every_table(tables):
+    for title, tasks in (("Tables I and II", EXPERIMENTS), ("A hard test: obstacles that cross the flock", CROSSING)):
+        medians = [row for row in tables[title] if "median" in row[0]]
+        expected = [
+            (task, rows) for task in tasks for rows in ROWS if task in rows.tasks and rows.name in shipped_policies()
+        ]
+        assert expected
+        for (task, rows), (label, safety_filter, *cells) in zip(expected, medians, strict=True):
+            card = read_card(rows.name)
+            assert label.startswith(f"`{rows.name}` ({rows.note}), median (range) of {len(card['seeds'])} trainings")
+            assert label.endswith(", from the model card")
+            assert safety_filter == f"`{card['config']['scenario']['safety_filter']}`"
+            over = over_seeds(card, task)
+            for cell, name in zip(cells, COLUMNS.values(), strict=True):
+                metric = over.get(name)
+                if metric is None:
+                    assert cell == ""
+                    continue
+                factor = 100 if METRICS[name].is_rate else 1
+                shown = [
+                    float(number) for number in re.fullmatch(r"([\d.]+)(?: %)? \(([\d.]+) to ([\d.]+)\)", cell).groups()
+                ]
+                assert shown == pytest.approx([factor * metric.mean, factor * metric.low, factor * metric.high], abs=0.051)
 
 
 def test_free_and_success_have_their_intervals(tables):
@@ -100,7 +108,9 @@ def test_free_and_success_have_their_intervals(tables):
             continue
         for label, _, *cells in rows:
             assert len(cells) == len(COLUMNS)
-            if "paper, Table" in label or "median" in label:
+            if "median" in label:
+                continue  # all cells have a range
+            if "paper, Table" in label:
                 assert "(" not in "".join(cells)
             else:
                 assert all(re.fullmatch(r"[\d.]+ % \([\d.]+ to [\d.]+\)", cell) for cell in cells[-2:]), label
@@ -110,7 +120,8 @@ def test_with_the_filter_no_separation_to_neighbors_is_violated(tables):
     violations = list(COLUMNS).index("neighbor violations") + 2
     filtered = [row for rows in tables.values() for row in rows if row[1] == "`announce`"]
     assert len(filtered) > 20
-    assert {row[violations] for row in filtered} <= {"0.00 %", ""}  # "": a single vehicle
+    cells = {row[violations] for row in filtered}
+    assert cells <= {"0.00 %", "0.00 % (0.00 to 0.00)", ""}  # "": a single vehicle
 
 
 def test_flock_sizes_and_sensor_errors_have_a_row_each(tables):

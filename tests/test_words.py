@@ -30,7 +30,7 @@ OLD_WORDS = {
     r"\bsurroundings\b|\binexactness\b|\bwrite_whole\b": "runtime_info, reproducibility_warnings, atomic_write",
     r"\bjudg(e|es|ed|ing)\b": "evaluate",
     r"\bddpg-stock\b": "ddpg-sb3",
-    r"\bpaper-\dv\do\b|\bsecond-looks?\b": "ddpg-*, ddpg-bc-*",
+    r"\bpaper-\dv\do\b|\bsecond-looks?\b": "ddpg, flock",
     r"\bpromises\.md|\bchoices\.md|\brecipe\.md": "guarantees.md, paper_deviations.md, method.md",
     r"\bLearnerConfig\b|\blearner\.": "AlgorithmConfig, algorithm.",
 }

@@ -17,7 +17,7 @@ def add(parser: Parser) -> None:
     from sb3_flock.sim import Scenario
 
     parser.describe(
-        "ddpg-5v2o -o policy.onnx",
+        "flock -o policy.onnx",
         description="Write a policy from measured positions to speed and turn rate, and check it: as C99 for a "
         "microcontroller if FILE ends in .c, else as an ONNX graph.",
         usage="%(prog)s [-h] -o FILE [--trust] [--set KEY=VALUE] POLICY",

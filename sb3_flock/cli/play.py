@@ -12,7 +12,7 @@ from sb3_flock.cli.parsing import Parser
 def add(parser: Parser) -> None:
     """Add the arguments."""
     parser.describe(
-        "general --n-vehicles 8",
+        "flock --n-vehicles 8",
         description="Simulate live in a window: drag the waypoint, drop obstacles, add vehicles, show what one of them senses, "
         "switch the safety filter.",
         renamed=shared.ROLLOUT_RENAMED,

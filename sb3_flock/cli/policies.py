@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 def add(parser: Parser) -> None:
     """Add the arguments."""
     parser.describe(
-        "ddpg-bc-5v2o",
+        "flock",
         description="List the shipped policies with their results on test episodes, or show the model card of one.",
     )
     parser.add_argument("name", nargs="?", metavar="NAME", help="show this policy's model card")
@@ -35,7 +35,8 @@ def run(options: argparse.Namespace, words: Sequence[str]) -> int:
         console.print(_list())
         console.print(
             "A task 5v2o has 5 vehicles and 2 obstacles. RL is reinforcement learning alone; RL+MPC also imitates the MPC "
-            "expert.\n`sb3-flock policies NAME` shows a model card, `sb3-flock play NAME` the policy."
+            "expert. Results are with the safety filter that a policy was trained with.\n"
+            "`sb3-flock policies NAME` shows a model card, `sb3-flock play NAME` the policy."
         )
     else:
         _print_card(_known(options.name), console)
@@ -100,55 +101,74 @@ def _method(config: TrainingConfig) -> tuple[str, str]:
 
 
 def _print_card(name: str, console: Any) -> None:
-    from sb3_flock.evaluation.metrics import METRICS
-    from sb3_flock.evaluation.model_cards import over_seeds, read_card
-    from sb3_flock.evaluation.report import add_short_columns, plain_table, short_cells
-    from sb3_flock.pretrained import shipped_policies
+    from sb3_flock.evaluation.model_cards import read_card
+    from sb3_flock.evaluation.report import plain_table
 
     card = read_card(name)
-    shipped, path, config = _shipped(card), shipped_policies()[name], _config(card)
-    number = len(card["seeds"])
-    channels = "; motion channels" if config.scenario.motion_lag else ""
-    facts = {
-        "task": card["task"],
-        "method": f"{config.algo}: {_method(config)[1]}{channels}",
-        "trained": f"{shipped['transitions']} transitions, {shipped['minutes']:g} minutes",
-        "command": shipped["command"],
-        "with": listed(f"{package} {version}" for package, version in card["versions"].items()),
-        "trainings": f"{number}, which differ in the seed; the policy is that of seed {card['shipped_seed']}",
-        "file": f"{path.name}, {path.stat().st_size / 1e6:.1f} MB",
-    }
     grid = plain_table()
     grid.show_header = False
     grid.add_column(no_wrap=True)
     grid.add_column(overflow="fold")
-    for key, value in facts.items():
+    for key, value in _facts(name, card).items():
         grid.add_row(key, value)
     console.print(name)
     console.print(grid)
+    console.print(f"Results on {card['episodes']} episodes of the task:")
+    console.print(_results(card))
+    if "tasks" in _shipped(card):
+        number = len(card["seeds"])
+        which = "Results" if number == 1 else f"Medians of the {number} trainings"
+        console.print(f"{which} on {card['episodes']} episodes of each task, with the same filter:")
+        console.print(_results_of_tasks(card))
+
+
+def _facts(name: str, card: Mapping[str, Any]) -> dict[str, str]:
+    """What the card says about the training."""
+    from sb3_flock.pretrained import shipped_policies
+
+    shipped, path, config, number = _shipped(card), shipped_policies()[name], _config(card), len(card["seeds"])
+    level = config.scenario.safety_filter
+    channels = "; motion channels" if config.scenario.motion_lag else ""
+    of_several = f"{number}, which differ in the seed; the policy is that of seed {card['shipped_seed']}"
+    return {
+        "task": f"{card['task']}, {'no safety filter' if level == 'off' else f'safety filter {level}'}",
+        "method": f"{config.algo}: {_method(config)[1]}{channels}",
+        "trained": f"{shipped['transitions']} transitions, {shipped['minutes']:g} minutes",
+        "command": shipped["command"],
+        "with": listed(f"{package} {version}" for package, version in card["versions"].items()),
+        "trainings": of_several if number > 1 else f"1, of seed {card['shipped_seed']}",
+        "file": f"{path.name}, {path.stat().st_size / 1e6:.1f} MB",
+    }
+
+
+def _results(card: Mapping[str, Any]) -> Table:
+    """The metrics of the policy; beside them the median and the range over the trainings, if there are several."""
+    from sb3_flock.evaluation.metrics import METRICS
+    from sb3_flock.evaluation.model_cards import over_seeds
+    from sb3_flock.evaluation.report import plain_table
+
+    shipped, trainings, number = _shipped(card)["metrics"], over_seeds(card), len(card["seeds"])
     table = plain_table()
     table.add_column("metric", no_wrap=True)
-    table.add_column("policy", justify="right", no_wrap=True)
-    table.add_column(f"median of {number}", justify="right", no_wrap=True)
-    table.add_column("range", justify="right", no_wrap=True)
-    trainings = over_seeds(card)
-    for metric, kind in METRICS.items():
-        value, over = shipped["metrics"].get(metric), trainings.get(metric)
-        cells = ["-" if value is None else kind.format(value), "-", "-"]
-        if over is not None:
-            assert over.mean is not None
-            assert over.low is not None
-            assert over.high is not None
-            cells[1:] = kind.format(over.mean), f"{kind.format(over.low)} to {kind.format(over.high)}"
-        table.add_row(metric, *cells)
-    console.print(f"Results on {card['episodes']} episodes of the task:")
-    console.print(table)
-    if "tasks" in shipped:
-        table = plain_table(gap=1)
-        table.add_column("task", no_wrap=True)
-        add_short_columns(table)
-        for task in shipped["tasks"]:
-            medians = {metric: over.mean for metric, over in over_seeds(card, task).items()}
-            table.add_row(task, *short_cells(medians))
-        console.print(f"Medians of the {number} trainings on {card['episodes']} episodes of each task:")
-        console.print(table)
+    for heading in ("policy", *((f"median of {number}", "range") if number > 1 else ())):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for name, kind in METRICS.items():
+        over = trainings.get(name)
+        mean, low, high = (None, None, None) if over is None else (over.mean, over.low, over.high)
+        cells = ["-" if value is None else kind.format(value) for value in (shipped.get(name), mean)]
+        span = "-" if low is None or high is None else f"{kind.format(low)} to {kind.format(high)}"
+        table.add_row(name, *[*cells, span][: len(table.columns) - 1])
+    return table
+
+
+def _results_of_tasks(card: Mapping[str, Any]) -> Table:
+    """A line for each task: the medians over the trainings."""
+    from sb3_flock.evaluation.model_cards import over_seeds
+    from sb3_flock.evaluation.report import add_short_columns, plain_table, short_cells
+
+    table = plain_table(gap=1)
+    table.add_column("task", no_wrap=True)
+    add_short_columns(table)
+    for task in _shipped(card)["tasks"]:
+        table.add_row(task, *short_cells({metric: over.mean for metric, over in over_seeds(card, task).items()}))
+    return table

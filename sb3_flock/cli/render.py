@@ -14,7 +14,7 @@ from sb3_flock.cli.parsing import Parser, count
 def add(parser: Parser) -> None:
     """Add the arguments."""
     parser.describe(
-        "ddpg-5v2o -o episode.html --episode 3",
+        "flock -o episode.html --episode 3",
         description="Simulate one episode and write it: .gif, .mp4 and .html are videos, .png and .svg show the paths.",
         renamed={**shared.ROLLOUT_RENAMED, "--out": "--output"},
     )

@@ -15,7 +15,7 @@ def add(parser: Parser) -> None:
     from sb3_flock.sim import Scenario
 
     parser.describe(
-        "ddpg-bc-5v2o --vehicle 0 --ros-args -p n_vehicles:=8",
+        "flock --vehicle 0 --ros-args -p n_vehicles:=8",
         description="Drive one vehicle by a policy, as a node of ROS 2: poses in, velocities out. It runs until Ctrl-C, and "
         "stops the vehicle when a pose is lost. docs/ros2.md lists the topics and parameters.",
         usage="%(prog)s [-h] --vehicle I [--trust] [--set KEY=VALUE] POLICY\n       [--ros-args ...]",

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
-POLICY_HELP = "a zip, a run folder (its best_model.zip) or a shipped policy's name, such as ddpg-5v2o"
+POLICY_HELP = "a zip, a run folder (its best_model.zip) or a shipped policy's name, such as flock"
 
 
 def add_output(parser: Parser, what: str, metavar: str = "FILE", **kwargs: Any) -> None:

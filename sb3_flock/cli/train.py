@@ -86,6 +86,7 @@ def _help(path: str) -> str:
         sizes = listed(map(str, TrainEnvConfig().flock_sizes or ()))
         text = f"number of vehicles of the task (paper: 3 or 5); the training env has flocks of {sizes}, unless "
         text += "--expert mpc or --set train_env.flock_sizes=null"
+    null = null.removesuffix(" (paper: null)")
     return f"{text} [{null if field.default is None else field.default}]".replace("%", "%%")
 
 

@@ -31,16 +31,15 @@ from sb3_flock.envs.flocking_v0 import action_space, observation_space
 from sb3_flock.pretrained import shipped_policies
 from sb3_flock.rl.ddpg import FlockDDPG
 from sb3_flock.rl.registry import ALGORITHMS, build_model, fewest_parameters, policy_kwargs
-from sb3_flock.serialization.migrate import MEMBER, check_format, migrate_config, migrate_weights
+from sb3_flock.serialization.migrate import FORMAT, MEMBER, check_format, migrate_config, migrate_weights
 from sb3_flock.serialization.yaml_io import load_config
 from sb3_flock.settings import SettingsError, UserError
 from sb3_flock.sim import Scenario, check_actions
 
 _CHECKPOINT = re.compile(r"rl_model_(\d+)_steps\.zip")
 
-
-_UNFILTERED = 3
-"""The format as which files that SB3 alone saved are read: up to it, tasks have no safety filter unless they say so."""
+_UNFILTERED = {"safety_filter": "off", "shared_detections": False}
+"""What is assumed of the task of a file that SB3 alone saved: the paper's, not that of a training of ours."""
 
 
 class PolicyError(UserError):
@@ -218,7 +217,7 @@ def load_policy(path: str | Path, device: str = "cpu", trust: bool = False) -> L
     except _UnknownPartsError as error:
         if not trust:
             raise PolicyError(f"{path}: {error}; with trust, SB3 loads it and runs any code in it") from None
-        has_member, member, weights = False, {"format": _UNFILTERED, "config": {}}, {}
+        has_member, member, weights = False, {"format": FORMAT, "config": {"scenario": _UNFILTERED}}, {}
     except Exception as error:  # zipfile, json and torch raise many kinds for a damaged file; all mean the same here
         raise PolicyError(f"{path}: damaged or not a policy file ({first_line(error)})") from None
     try:
@@ -353,7 +352,7 @@ def _describe_plain_file(archive: zipfile.ZipFile) -> dict[str, Any]:
         ours = data["policy_class"]["__module__"].startswith("sb3_flock.")
         kwargs = data["policy_kwargs"]
         config = {
-            "scenario": {"max_speed": high[0], "max_turn_rate": high[1], **observation},
+            "scenario": {**_UNFILTERED, "max_speed": high[0], "max_turn_rate": high[1], **observation},
             "network": {
                 "channels": [shape[0] for shape in convolutions],
                 "kernel_size": convolutions[0][2],
@@ -366,7 +365,7 @@ def _describe_plain_file(archive: zipfile.ZipFile) -> dict[str, Any]:
     except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
         why = f"not a policy of sb3_flock, nor one of DDPG or TD3 with FlockCNN ({first_line(error)})"
         raise _UnknownPartsError(why) from None
-    return {"format": _UNFILTERED, "config": config}
+    return {"format": FORMAT, "config": config}
 
 
 def _observation_fields(channels: int, n_anchors: int, _: int) -> dict[str, Any]:

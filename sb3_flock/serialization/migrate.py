@@ -16,6 +16,7 @@ import numpy as np
 
 from sb3_flock._renamed import rename_fields
 from sb3_flock.settings import Settings, SettingsError, format_value, group_of
+from sb3_flock.sim import Scenario
 
 FORMAT = 4
 """The format that this version writes."""
@@ -32,6 +33,16 @@ def check_format(number: Any) -> int:
     if isinstance(number, int) and 1 <= number <= FORMAT:
         return number
     raise SettingsError(f"format = {format_value(number)}: this version reads formats 1 to {FORMAT}")
+
+
+def format_of(settings: type[Settings], values: Mapping[str, Any]) -> int:
+    """The format of a config file's values: its number, or what its names tell. Files had no number up to format 2.
+
+    :raises SettingsError: for a number that this version does not read
+    """
+    if "format" in values:
+        return check_format(values["format"])
+    return 2 if _rename(settings, values, "")[1] else FORMAT
 
 
 def migrate_config(
@@ -80,16 +91,41 @@ def _without_max_vehicles(values: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 _BEFORE_FORMAT_4: dict[str, dict[str, Any]] = {
-    "scenario": {"safety_filter": "off", "shared_detections": False},
-    "train_env": {"action_repeat": 1},
+    "scenario": {
+        "safety_filter": "off",
+        "shared_detections": False,
+        "reward": {"link_bonus": 0.5, "lambda_": 0.7},
+    },
+    "train_env": {
+        "flock_sizes": (4,),
+        "extra_obstacles": 1,
+        "time_step_scale": 2.0,
+        "action_repeat": 1,
+        "separation_scale": 1.06,
+        "obstacle_separation_scale": None,
+    },
 }
-"""By group: fields that files of earlier formats, which are whole, leave out where they did not exist yet, and their values then."""
+"""The defaults that format 4 changed, as they were. They stand for the fields that a file of an earlier format leaves out,
+because the file is a part of a config, or because the release that wrote the file did not have the field."""
 
 
 def _fill_in(settings: type[Settings], values: dict[str, Any]) -> None:
     for group, then in _BEFORE_FORMAT_4.items():
         if group in settings.model_fields and isinstance(values.get(group, {}), Mapping):
-            values[group] = {**then, **values.get(group, {})}
+            values[group] = _filled(then, values.get(group, {}))
+    scenario = values.get("scenario")
+    if isinstance(scenario, dict) and scenario.get("shared_detections") and scenario.get("obstacle_radius") is None:
+        # The default of the obstacle channel's range did not grow with the detections of the neighbors.
+        scenario["obstacle_radius"] = scenario.get("detection_range", Scenario().detection_range)
+
+
+def _filled(then: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """A group's values, with earlier defaults for the fields that it leaves out."""
+    filled = {**then, **values}
+    for name, inner in then.items():
+        if isinstance(inner, Mapping) and isinstance(filled[name], Mapping):
+            filled[name] = _filled(inner, filled[name])
+    return filled
 
 
 def _drop_idle_options(values: dict[str, Any]) -> None:

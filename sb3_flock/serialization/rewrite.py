@@ -20,7 +20,7 @@ from sb3_flock.config.training import TrainingConfig
 from sb3_flock.envs.vec_env import make_vec_env
 from sb3_flock.rl.registry import build_model
 from sb3_flock.serialization.load import PolicyError, first_line, load_policy, read_member
-from sb3_flock.serialization.migrate import FORMAT, MEMBER, check_format, migrate_config
+from sb3_flock.serialization.migrate import FORMAT, MEMBER, check_format, format_of, migrate_config
 from sb3_flock.serialization.save import atomic_write
 from sb3_flock.serialization.yaml_io import check_groups, read_yaml, to_yaml
 from sb3_flock.settings import SettingsError, UserError, leaf_paths
@@ -155,8 +155,8 @@ def _config(path: Path) -> bytes | None:
         current = _sweep(values)
         return None if current == values else _dump(current, text)
     with _errors_of(path):
-        has_format = "format" in values
-        number = check_format(values.pop("format", FORMAT))
+        number = format_of(TrainingConfig, values)
+        has_format = values.pop("format", None) is not None
         current, renamed = migrate_config(TrainingConfig, values, number)
         check_groups(TrainingConfig, current)
         config = TrainingConfig(**current)

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import yaml
 
 from sb3_flock._renamed import RenamedWarning
-from sb3_flock.serialization.migrate import FORMAT, check_format, migrate_config
+from sb3_flock.serialization.migrate import FORMAT, format_of, migrate_config
 from sb3_flock.settings import Settings, SettingsError, format_value, group_of, leaf_paths, resolve_path, suggest
 
 _Settings = TypeVar("_Settings", bound=Settings)
@@ -149,7 +149,8 @@ _MOST_SHOWN = 2
 
 def _migrated(settings: type[Settings], values: dict[str, Any], path: Path) -> dict[str, Any]:
     """A file's values in the present format; one warning names old names in it."""
-    number = check_format(values.pop("format", FORMAT))
+    number = format_of(settings, values)
+    values.pop("format", None)
     current, renamed = migrate_config(settings, values, number)
     if renamed:
         warnings.warn(EarlierFormatWarning(path, renamed), stacklevel=3)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 PEERS = Path(__file__).parent / "peers"
-POLICY = "ddpg-5v2o"
+POLICY = "ddpg"
 """The shipped policy whose flocks the benchmarks measure."""
 
 

@@ -20,7 +20,7 @@ from tests.helpers import PlainCNN, expert_vec_env
 CONFIGS = Path(__file__).parents[2] / "configs"
 
 CONFIG = load_config(TrainingConfig, overrides={"n_vehicles": 5, "n_obstacles": 2})
-SHAPES = {"default": CONFIG, "ddpg-bc": load_config(TrainingConfig, CONFIGS / "ddpg_bc_5v2o.yaml")}
+SHAPES = {"default": CONFIG, "flock": load_config(TrainingConfig, CONFIGS / "flock.yaml")}
 """The networks of the shipped policies: two convolutions of 3 channels, and one of 6 channels."""
 UPDATES = 25
 
@@ -215,5 +215,5 @@ def test_peers_in_updates(benchmark, peer, shape, batch_size):
     """SBX with the same networks and the compiled update in turn, in one process of one thread; see the peer's script."""
     words = ["updates", "--batch", batch_size]
     if shape != "default":
-        words += ["--config", CONFIGS / "ddpg_bc_5v2o.yaml"]
+        words += ["--config", CONFIGS / "flock.yaml"]
     benchmark.extra_info |= benchmark.pedantic(peer, ("training.py", *words), rounds=1)

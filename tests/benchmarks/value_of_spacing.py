@@ -1,4 +1,4 @@
-"""The critics' value of a tight flock and the true one: ``python tests/benchmarks/value_of_spacing.py ddpg-5v2o value.png``.
+"""The critics' value of a tight flock and the true one: ``python tests/benchmarks/value_of_spacing.py ddpg value.png``.
 
 Three vehicles stand around the waypoint, each at the same distance from the other two, with random headings. The critics' value
 of this state is compared with the discounted reward that the same policy then collects in the training env, without and with

@@ -5,7 +5,6 @@ import yaml
 
 from sb3_flock.cli import main
 
-CONFIGS = Path(__file__).parents[2] / "configs"
 RUN = Path(__file__).parent.parent / "data" / "format_2" / "runs" / "ddpg"
 
 
@@ -30,9 +29,9 @@ def test_flags_win_over_the_config_file(tmp_path, capsys):
 
 @pytest.mark.parametrize("flag", ["-n", "--total-timesteps", "--n-timesteps"])
 def test_rl_zoos_flags_are_ours_and_numbers_may_have_an_exponent(flag, capsys):
-    config = printed(capsys, flag, "1e5", "-f", "logs", "-i", "general", "--set", "learning_starts=2e3")
+    config = printed(capsys, flag, "1e5", "-f", "logs", "-i", "flock", "--set", "learning_starts=2e3")
     assert (config["total_timesteps"], config["algorithm"]["learning_starts"]) == (100_000, 2000)
-    assert (config["output_dir"], config["init_from"]) == ("logs", "general")
+    assert (config["output_dir"], config["init_from"]) == ("logs", "flock")
     config = printed(capsys, "--log-folder", "a", "--trained-agent", "b", "--seed", "3.0")
     assert (config["output_dir"], config["init_from"], config["seed"]) == ("a", "b", 3)
 
@@ -44,15 +43,34 @@ def test_numbers_of_a_file_may_have_an_exponent(tmp_path, capsys):
     assert (config["algorithm"]["batch_size"], config["algorithm"]["gamma"]) == (100, 0.9)
 
 
-def test_expert_mpc_is_the_training_of_its_config_file_for_any_task(capsys):
+def test_expert_mpc_is_a_training_of_its_own_for_any_task(capsys):
+    """Beside which config file it stands is tested with the presets."""
     preset = printed(capsys, "--expert", "mpc", "--n-vehicles", "5", "--n-obstacles", "2")
-    file = printed(capsys, "--config", str(CONFIGS / "ddpg_bc_5v2o.yaml"))
-    assert preset["train_env"].pop("flock_sizes") is None  # as in the task
-    assert file["train_env"].pop("flock_sizes") == [5]
-    assert preset == file
+    assert preset["train_env"]["flock_sizes"] is None  # as in the task
     other = printed(capsys, "--expert", "mpc")
     task = {"n_vehicles": 3, "n_obstacles": 1}
-    assert other == {**preset, "scenario": {**preset["scenario"], **task}, "train_env": other["train_env"]}
+    assert other == {**preset, "scenario": {**preset["scenario"], **task}}
+
+
+def test_the_task_of_a_training_has_the_filter_unless_the_file_or_a_flag_says_otherwise(tmp_path, capsys):
+    for words in ([], ["--n-vehicles", "5"], ["--expert", "mpc"], ["--config", write(tmp_path, "scenario: {arena: 2}\n")]):
+        scenario = printed(capsys, *words)["scenario"]
+        assert (scenario["safety_filter"], scenario["shared_detections"]) == ("announce", True)
+    scenario = printed(capsys, "--set", "safety_filter=off", "--set", "shared_detections=false")["scenario"]
+    assert (scenario["safety_filter"], scenario["shared_detections"]) == ("off", False)
+    for off in ("off", "'off'"):
+        file = write(tmp_path, f"scenario: {{safety_filter: {off}}}\n")
+        assert printed(capsys, "--config", file)["scenario"]["safety_filter"] == "off"
+        assert printed(capsys, "--config", file, "--expert", "mpc")["scenario"]["safety_filter"] == "off"
+        heading = printed(capsys, "--config", file, "--set", "safety_filter=heading")
+        assert heading["scenario"]["safety_filter"] == "heading"
+
+
+def test_ranges_that_do_not_fit_the_filter_are_one_line_that_says_that_it_can_be_off(fails, capsys):
+    words = ["config", "--set", "max_speed=0.5"]
+    fails(words, "link_range = 0.15: safety_filter needs more than neighbor_separation", "it can be off")
+    assert main([*words, "--set", "safety_filter=off"]) == 0
+    assert "max_speed: 0.5 " in capsys.readouterr().out
 
 
 def test_the_preset_of_an_expert_gives_way_to_the_file_and_to_every_other_flag(tmp_path, capsys):

@@ -44,7 +44,8 @@ def test_a_policys_old_name_works_with_one_line(capsys, monkeypatch):
     monkeypatch.setattr("sb3_flock.cli.shared.evaluate_and_print", lambda *args, **kwargs: {})
     assert main(["evaluate", "second-look-3v1o"]) == 0
     assert capsys.readouterr().err == (
-        "sb3-flock: warning: policy second-look-3v1o is now ddpg-bc-3v1o; the old name works for one release\n"
+        "sb3-flock: warning: policy second-look-3v1o is now flock, with its own task and the safety filter; "
+        "the old name works for one release\n"
     )
 
 

@@ -21,12 +21,12 @@ def test_set_changes_the_scenario(tmp_path, monkeypatch):
     exported = []
     done = ExportResult(tmp_path, 1, 0.0, 0.0)
     monkeypatch.setattr("sb3_flock.deploy.onnx_export.export", lambda *_, scenario: exported.append(scenario) or done)
-    words = ["export", "ddpg-3v1o", "-o", str(tmp_path / "policy.onnx")]
-    assert main([*words, "--set", "safety_filter=announce", "--set", "safety_margin=0.01"]) == 0
+    words = ["export", "ddpg", "-o", str(tmp_path / "policy.onnx")]
+    assert main([*words, "--set", "safety_filter=heading", "--set", "safety_margin=0.01"]) == 0
     assert main(words) == 0
-    filtered, plain = exported
-    assert (filtered.safety_filter, filtered.safety_margin) == ("announce", 0.01)
-    assert plain == load_policy("ddpg-3v1o").scenario
+    changed, plain = exported
+    assert (changed.safety_filter, changed.safety_margin) == ("heading", 0.01)
+    assert plain == load_policy("ddpg").scenario
 
 
 @pytest.mark.parametrize(
@@ -38,4 +38,4 @@ def test_set_changes_the_scenario(tmp_path, monkeypatch):
     ],
 )
 def test_settings_that_do_not_fit_the_policy_are_one_line(setting, message, fails, tmp_path):
-    fails(["export", "ddpg-3v1o", "-o", str(tmp_path / "policy.onnx"), "--set", setting], message)
+    fails(["export", "ddpg", "-o", str(tmp_path / "policy.onnx"), "--set", setting], message)

@@ -21,12 +21,12 @@ from sb3_flock.settings import SettingsError
         (["evaluate", "no/such.zip"], ["no/such.zip", "no such file or run folder"]),
         (["evaluate", __file__], ["damaged or not a policy file"]),
         (["evaluate", os.path.dirname(__file__)], ["no best_model.zip"]),
-        (["render", "ddpg-5v2o"], ["-o/--output"]),
-        (["render", "ddpg-5v2o", "-o", "x.avi"], ["--output x.avi: a name that ends in .gif, .mp4, .html, .png, .svg"]),
-        (["render", "ddpg-5v2o", "-o", "no/such/x.gif"], ["--output no/such/x.gif: there is no folder no/such"]),
-        (["export", "ddpg-5v2o"], ["-o FILE"]),
-        (["export", "ddpg-5v2o", "a.onnx", "-o", "b.onnx"], ["one -o FILE"]),
-        (["export", "ddpg-5v2o", "-o", "no/such/a.onnx"], ["--output no/such/a.onnx: there is no folder no/such"]),
+        (["render", "ddpg"], ["-o/--output"]),
+        (["render", "ddpg", "-o", "x.avi"], ["--output x.avi: a name that ends in .gif, .mp4, .html, .png, .svg"]),
+        (["render", "ddpg", "-o", "no/such/x.gif"], ["--output no/such/x.gif: there is no folder no/such"]),
+        (["export", "ddpg"], ["-o FILE"]),
+        (["export", "ddpg", "a.onnx", "-o", "b.onnx"], ["one -o FILE"]),
+        (["export", "ddpg", "-o", "no/such/a.onnx"], ["--output no/such/a.onnx: there is no folder no/such"]),
         (["compare", "x", "-o", "curves.pdf"], ["--output curves.pdf: a name that ends in .png, .svg is needed"]),
         (["reproduce", "-o", "/dev/null/x"], ["--output /dev/null/x: "]),
         (["sweep"], ["a FILE or --resume DIR is needed"]),
@@ -99,7 +99,7 @@ def test_the_package_and_the_main_help_import_no_part_of_it(code):
 
 
 @pytest.mark.parametrize(
-    "words", [*([name, "--help"] for name in COMMANDS), ["config"], ["policies"], ["policies", "general"]]
+    "words", [*([name, "--help"] for name in COMMANDS), ["config"], ["policies"], ["policies", "flock"]]
 )
 def test_help_and_what_only_prints_need_nothing_heavy(words):
     assert imported(f"from sb3_flock.cli import main; main({words})", HEAVY) == []

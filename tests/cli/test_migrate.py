@@ -4,6 +4,7 @@ from pathlib import Path
 import pytest
 
 from sb3_flock.cli import main
+from sb3_flock.serialization.migrate import FORMAT
 
 DATA = Path(__file__).parent.parent / "data" / "format_2"
 
@@ -14,10 +15,10 @@ def test_a_line_for_each_file_and_nothing_to_do_the_second_time(tmp_path, capsys
     shutil.copy(DATA / "runs" / "ddpg" / "config.yaml", files[1])
     assert main(["migrate", *map(str, files)]) == 0
     captured = capsys.readouterr()
-    assert captured.out == "".join(f"{file}: rewritten in the present format (3)\n" for file in files)
+    assert captured.out == "".join(f"{file}: rewritten in the present format ({FORMAT})\n" for file in files)
     assert captured.err == ""
     assert main(["migrate", *map(str, files)]) == 0
-    assert capsys.readouterr().out == "".join(f"{file}: has the present format (3)\n" for file in files)
+    assert capsys.readouterr().out == "".join(f"{file}: has the present format ({FORMAT})\n" for file in files)
     assert main(["config", "--config", str(files[1])]) == 0
     assert capsys.readouterr().err == ""
 
@@ -34,7 +35,7 @@ def test_a_refused_file_is_one_line_and_does_not_stop_the_others(tmp_path, capsy
         f"sb3-flock: {checkpoint}: a checkpoint, which is migrated when its training is resumed",
         f"sb3-flock: {__file__}: not a policy (zip), model card (.json) or config (.yaml)",
     ]
-    assert captured.out == f"{policy}: rewritten in the present format (3)\n"
+    assert captured.out == f"{policy}: rewritten in the present format ({FORMAT})\n"
     assert checkpoint.read_bytes() == before
 
 

@@ -2,7 +2,7 @@ import pytest
 
 from sb3_flock.cli import main
 
-POLICY = "ddpg-3v1o"
+POLICY = "ddpg"
 
 
 def test_the_node_gets_the_policy_the_task_and_the_arguments_of_ros(monkeypatch, capsys):

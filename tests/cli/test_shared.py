@@ -18,9 +18,9 @@ def options(**given):
 
 
 def test_a_policy_brings_its_scenario_and_flags_change_it():
-    policy, name, scenario = rollout_of(options(policy="ddpg-5v2o", n_vehicles=7, set=["arena=2"]))
+    policy, name, scenario = rollout_of(options(policy="ddpg", n_vehicles=7, set=["arena=2"]))
     assert isinstance(policy, LoadedPolicy)
-    assert name.endswith("ddpg-5v2o.zip")
+    assert name.endswith("ddpg.zip")
     assert scenario == policy.scenario.replace(n_vehicles=7, arena=2.0)
     assert policy.scenario.n_vehicles == 5
 
@@ -31,7 +31,7 @@ def test_a_controller_starts_from_the_default_scenario():
     assert (name, scenario) == ("go-to-waypoint", Scenario(obstacle_motion="crossing"))
 
 
-@pytest.mark.parametrize("given", [{}, {"policy": "general", "controller": "orca"}])
+@pytest.mark.parametrize("given", [{}, {"policy": "flock", "controller": "orca"}])
 def test_exactly_one_of_them_is_needed(given):
     with pytest.raises(SettingsError, match="evaluate: a POLICY or --controller NAME is needed, and not both"):
         rollout_of(options(**given))

@@ -46,8 +46,8 @@ def test_flags_reach_the_sweep(sweep_of, tmp_path):
     code, ((config, output, address),) = sweep_of([trial("done")], "--set", "total_timesteps=1e3", "--address", "auto")
     assert (code, output, address) == (0, str(tmp_path / "out"), "auto")
     assert config.training({"seed": 1}).total_timesteps == 1000
-    _, ((config, *_),) = sweep_of([trial("done")], "--evaluate", "general", "-n", "7")
-    assert (config.policy, config.episodes) == ("general", 7)
+    _, ((config, *_),) = sweep_of([trial("done")], "--evaluate", "flock", "-n", "7")
+    assert (config.policy, config.episodes) == ("flock", 7)
 
 
 def test_episodes_without_a_policy_are_refused(fails, tmp_path):

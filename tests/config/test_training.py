@@ -7,6 +7,10 @@ from sb3_flock._renamed import RenamedWarning
 from sb3_flock.config.training import TaskConfig, TrainEnvConfig, TrainingConfig
 from sb3_flock.serialization.yaml_io import load_config
 from sb3_flock.settings import SettingsError
+from sb3_flock.sim import Scenario
+
+OFF = {"safety_filter": "off"}
+"""For steps so long that the filter needs wider ranges."""
 
 
 def test_the_training_env_has_its_own_flock_sizes_or_the_tasks():
@@ -18,7 +22,8 @@ def test_the_training_env_has_its_own_flock_sizes_or_the_tasks():
 
 def test_the_training_env_is_harder_than_the_task_and_scales_with_it():
     overrides = {"n_obstacles": 1, "obstacle_arena": 40.0, "neighbor_separation": 2.0, "link_range": 2.04}
-    overrides |= {"obstacle_separation": 3.0, "detection_range": 5.0}
+    overrides |= {"obstacle_separation": 3.0, "detection_range": 5.0, "safety_filter": "off"}
+    overrides |= {"train_env.flock_sizes": 4, "obstacle_arena_scale": 0.5, "obstacle_separation_scale": None}
     config = load_config(TrainingConfig, overrides={**overrides, "extra_obstacles": 3, "separation_scale": 1.1})
     changed = config.training_scenarios()[0]
     assert (changed.n_obstacles, changed.obstacle_arena, changed.neighbor_separation) == (4, 20.0, 2.04)
@@ -31,10 +36,10 @@ def test_the_training_env_is_harder_than_the_task_and_scales_with_it():
 
 
 def test_the_training_env_takes_longer_steps_for_the_same_time():
-    config = load_config(TrainingConfig, overrides={"max_cycles": 200, "time_step": 0.1, "time_step_scale": 2.5})
+    config = load_config(TrainingConfig, overrides={"max_cycles": 200, "time_step": 0.1, "time_step_scale": 2.5, **OFF})
     changed = config.training_scenarios()[0]
     assert (changed.max_cycles, changed.time_step) == (80, 0.25)
-    shortest = load_config(TrainingConfig, overrides={"max_cycles": 1, "time_step_scale": 10})
+    shortest = load_config(TrainingConfig, overrides={"max_cycles": 1, "time_step_scale": 10, **OFF})
     assert shortest.training_scenarios()[0].max_cycles == 1
 
 
@@ -59,7 +64,12 @@ def test_each_motion_of_the_obstacles_has_flocks_of_its_own_and_crossing_obstacl
 
 def test_with_every_change_switched_off_the_training_env_is_the_task():
     train_env = TrainEnvConfig(
-        flock_sizes=None, extra_obstacles=0, obstacle_arena_scale=1.0, time_step_scale=1.0, separation_scale=1.0
+        flock_sizes=None,
+        extra_obstacles=0,
+        obstacle_arena_scale=1.0,
+        time_step_scale=1.0,
+        separation_scale=1.0,
+        obstacle_separation_scale=1.0,
     )
     config = TaskConfig(train_env=train_env)
     (same,) = config.training_scenarios()
@@ -68,10 +78,10 @@ def test_with_every_change_switched_off_the_training_env_is_the_task():
 
 def test_a_motion_lag_must_be_a_multiple_of_the_training_envs_time_step():
     with pytest.raises(SettingsError, match=r"motion_lag = 0\.3: input should be a multiple of 0\.2 s, the training env's"):
-        load_config(TrainingConfig, overrides={"motion_lag": 0.3})
+        load_config(TrainingConfig, overrides={"motion_lag": 0.3, "time_step_scale": 2.0})
     with pytest.raises(SettingsError, match=r"motion_lag = 0\.1: input should be a multiple of 0\.2 s"):
-        load_config(TrainingConfig, overrides={"motion_lag": 0.1})
-    config = load_config(TrainingConfig, overrides={"motion_lag": 0.4})
+        load_config(TrainingConfig, overrides={"motion_lag": 0.1, "time_step_scale": 2.0})
+    config = load_config(TrainingConfig, overrides={"motion_lag": 0.4, "time_step_scale": 2.0, **OFF})
     assert config.training_scenarios()[0].motion_lag == 0.4
 
 
@@ -122,16 +132,54 @@ def test_names_of_the_previous_release_warn_and_work():
     assert config.algo == "ddpg-sb3"
 
 
+@pytest.mark.parametrize("task", [TaskConfig, TrainingConfig])
+def test_a_trainings_task_has_the_filter_unless_it_says_otherwise(task):
+    with_filter = Scenario(safety_filter="announce", shared_detections=True)
+    assert task().scenario == task(scenario={}).scenario == with_filter
+    assert task(scenario={"n_vehicles": 5}).scenario == with_filter.replace(n_vehicles=5)
+    assert task(scenario={"safety_filter": "off"}).scenario == with_filter.replace(safety_filter="off")
+    assert task(scenario={"shared_detections": False}).scenario == with_filter.replace(shared_detections=False)
+    assert task(scenario={"safety_filter": "heading"}).scenario.safety_filter == "heading"
+
+
+def test_a_whole_scenario_stays_as_it_is():
+    assert (Scenario().safety_filter, Scenario().shared_detections) == ("off", False)
+    assert TrainingConfig(scenario=Scenario()).scenario == Scenario()
+    off = TrainingConfig(scenario=Scenario(n_vehicles=4))
+    assert off.replace(seed=1).scenario == Scenario(n_vehicles=4)
+    assert load_config(TrainingConfig, base=off, overrides={"seed": 1}).scenario == Scenario(n_vehicles=4)
+    assert TrainingConfig(**off.model_dump()) == TrainingConfig(**off.model_dump(mode="json")) == off
+    assert load_config(TrainingConfig, overrides={"safety_filter": "off"}).scenario.safety_filter == "off"
+    with pytest.raises(SettingsError, match="scenario = 3"):
+        TrainingConfig(scenario=3)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "named"),
+    [
+        ({"max_speed": 0.5}, "link_range = 0.15: safety_filter needs more than neighbor_separation"),
+        ({"link_range": 0.1}, "link_range = 0.1: safety_filter needs more than neighbor_separation"),
+        ({"time_step_scale": 2.0}, "link_range = 0.15: safety_filter needs more than neighbor_separation"),
+    ],
+)
+def test_a_task_whose_ranges_do_not_fit_the_filter_is_one_line_that_says_that_it_can_be_off(overrides, named):
+    with pytest.raises(SettingsError, match=named) as error:
+        load_config(TrainingConfig, overrides=overrides).training_scenarios()
+    assert str(error.value).endswith("; it can be off")
+    assert "\n" not in str(error.value)
+    assert load_config(TrainingConfig, overrides={**overrides, "safety_filter": "off"}).training_scenarios()
+
+
 def test_a_config_is_importable_without_torch():
     code = "import sys; from sb3_flock import TrainingConfig; TrainingConfig(); sys.exit('torch' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_the_filter_of_a_training_env_keeps_the_tasks_separations():
-    config = load_config(TrainingConfig, overrides={"separation_scale": 1.2, "safety_margin": 0.01, "n_vehicles": 7})
+    config = load_config(TrainingConfig, overrides={"separation_scale": 1.05, "safety_margin": 0.01, "n_vehicles": 7})
     (scenario,) = config.training_scenarios()
     safety = config.training_safety(scenario)
-    assert scenario.neighbor_separation == pytest.approx(0.12)
+    assert scenario.neighbor_separation == pytest.approx(0.105)
     assert (safety.neighbor_separation, safety.obstacle_separation, safety.safety_margin) == (0.1, 0.15, 0.01)
     same = {"neighbor_separation", "obstacle_separation"}
     assert all(getattr(safety, name) == getattr(scenario, name) for name in set(type(safety).model_fields) - same)

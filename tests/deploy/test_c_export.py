@@ -47,11 +47,12 @@ def library(small):
 @pytest.mark.parametrize(
     ("name", "changes"),
     [
-        ("ddpg-3v1o", {}),
-        ("ddpg-bc-5v2o", {"safety_filter": "motion", "obstacle_filter": True}),
-        ("ddpg-bc-5v2o", {"safety_filter": "announce", "obstacle_filter": True, "safety_margin": 0.002}),
-        ("ddpg-bc-5v2o", {"safety_filter": "announce", "shared_detections": True, "obstacle_radius": 0.35}),
-        ("crossing-5v2o", {"safety_filter": "heading"}),
+        ("ddpg", {}),
+        ("ddpg", {"safety_filter": "off", "shared_detections": False}),
+        ("flock", {"safety_filter": "motion", "obstacle_filter": True}),
+        ("flock", {"safety_filter": "announce", "obstacle_filter": True, "safety_margin": 0.002}),
+        ("flock", {}),
+        ("flock", {"safety_filter": "heading"}),
     ],
 )
 def test_the_compiled_file_acts_as_policy_and_filter_do(name, changes):
@@ -84,10 +85,13 @@ def test_other_algorithms_networks_and_observations(tmp_path, changes):
     assert np.std(actions, axis=0).max() > 0.01
 
 
+@pytest.mark.filterwarnings("ignore:.*trained with shared_detections")
 @pytest.mark.parametrize("safety_filter", ["motion", "announce"])
 def test_a_flock_of_microcontrollers_flies_as_the_world_does(safety_filter):
-    policy = load_policy("ddpg-bc-3v1o")
-    scenario = policy.scenario.replace(safety_filter=safety_filter, obstacle_filter=True, safety_margin=0.002)
+    policy = load_policy("flock")
+    scenario = policy.scenario.replace(
+        safety_filter=safety_filter, obstacle_filter=True, safety_margin=0.01, shared_detections=False
+    )
     with library_of(source_of(policy, scenario), scenario) as library:
         fly_as_the_world_does(library, scenario, policy)
 
@@ -255,7 +259,7 @@ def test_a_neighbor_at_the_same_place_or_at_the_separation_stops_the_vehicle(ann
 def moving(library):
     """A library of the level ``motion``, and an input with which the vehicle drives."""
     scenario = Scenario(safety_filter="motion", motion_lag=0.2, obstacle_filter=True)
-    policy = load_policy("ddpg-bc-3v1o")
+    policy = load_policy("flock")
     with library_of(source_of(policy, scenario), scenario) as built:
         samples = (inputs for inputs, _ in random_sample_inputs(scenario, 100, seed=0))
         for inputs in samples:
@@ -376,7 +380,7 @@ def test_a_program_includes_the_declarations_and_needs_nothing_else(small, tmp_p
 
 def test_the_program_in_the_documentation_compiles(tmp_path):
     page = (Path(__file__).parents[2] / "docs" / "deploy.md").read_text(encoding="utf-8")
-    policy = load_policy("ddpg-bc-3v1o")
+    policy = load_policy("flock")
     (tmp_path / "policy.c").write_text(source_of(policy, policy.scenario.replace(safety_filter="announce")))
     (tmp_path / "vehicle.c").write_text(page.split("```c\n")[1].split("```")[0])
     assert compile_with(tmp_path, *c_check.FLAGS, "-c", "vehicle.c").stderr == ""
@@ -400,7 +404,7 @@ def test_fast_math_is_refused(small, tmp_path):
 
 
 def test_weights_are_constant_and_activations_are_static(tmp_path):
-    policy = load_policy("ddpg-bc-5v2o")
+    policy = load_policy("flock")
     (tmp_path / "policy.c").write_text(source_of(policy, policy.scenario.replace(safety_filter="announce")))
     compile_with(tmp_path, "-c", "-O2", "-fstack-usage", "policy.c")
     text, data, bss = (
@@ -408,7 +412,8 @@ def test_weights_are_constant_and_activations_are_static(tmp_path):
         .stdout.split("\n")[1]
         .split()[:3]
     )
-    assert 4 * 112_930 < int(text) < 4 * 112_930 + 10_000
+    n_weights = sum(tensor.numel() for tensor in policy.policy.actor.parameters())
+    assert 4 * n_weights < int(text) < 4 * n_weights + 10_000
     assert int(data) == 0
     assert 4 * (726 + 800) <= int(bss) < 4 * (726 + 800) + 64
     frames = [int(line.split("\t")[1]) for line in (tmp_path / "policy.su").read_text().splitlines()]
@@ -457,7 +462,7 @@ def test_without_a_compiler_the_file_is_written_with_a_warning(small, tmp_path, 
 
 def test_the_command_writes_c_for_a_name_that_ends_in_c(tmp_path, capsys):
     path = tmp_path / "policy.c"
-    assert main(["export", "ddpg-3v1o", "-o", str(path), "--set", "safety_filter=voronoi"]) == 0
+    assert main(["export", "ddpg", "-o", str(path), "--set", "safety_filter=voronoi"]) == 0
     printed = capsys.readouterr()
     assert printed.out == f"{path}\n"
     assert re.match(

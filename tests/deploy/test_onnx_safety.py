@@ -30,6 +30,8 @@ from sb3_flock.sim import Scenario, World, episode_rng
 from sb3_flock.sim.safety import filter_actions
 from tests.sim.test_safety import DRIVERS, FILTERS, pack, random_task
 
+pytestmark = pytest.mark.filterwarnings("ignore:.*trained with shared_detections")
+
 KNOWN = {"motion": [], "announce": ["neighbor_headings", "neighbor_announced_speeds"]}
 """Inputs of a policy's graph that are there for the filter alone."""
 
@@ -257,13 +259,15 @@ def test_numbers_near_0_and_1_stay_in_the_graph():
 
 @pytest.fixture(scope="module")
 def policy():
-    return load_policy("ddpg-bc-3v1o")
+    return load_policy("flock")
 
 
 @pytest.fixture(scope="module", params=["motion", "announce"])
 def exported(request, policy, tmp_path_factory):
-    """A policy exported with a filter."""
-    scenario = policy.scenario.replace(safety_filter=request.param, obstacle_filter=True, safety_margin=0.002)
+    """A policy exported with a filter, for vehicles that know of the obstacles that they detect themselves."""
+    scenario = policy.scenario.replace(
+        safety_filter=request.param, obstacle_filter=True, safety_margin=0.01, shared_detections=False
+    )
     path = tmp_path_factory.mktemp("onnx") / "policy.onnx"
     if request.param == "motion":
         return scenario, export(policy, path, n_samples=100, scenario=scenario)
@@ -386,7 +390,7 @@ def fly_as_the_world_does(session, scenario, policy):
 
 
 def test_the_bounds_of_another_scenario_are_kept(tmp_path):
-    policy = load_policy("ddpg-3v1o")
+    policy = load_policy("ddpg")
     with pytest.warns(UserWarning, match="max_speed = 0.15, evaluated with 0.05"):
         done = export(policy, tmp_path / "slow.onnx", 20, scenario=policy.scenario.replace(max_speed=0.05))
     assert done.difference < TOLERANCE
@@ -395,7 +399,7 @@ def test_the_bounds_of_another_scenario_are_kept(tmp_path):
 def test_mistakes_are_one_line(policy, tmp_path):
     path = tmp_path / "policy.onnx"
     with pytest.raises(SettingsError, match="safety_filter = motion: motion_lag > 0 is needed"):
-        export(load_policy("ddpg-3v1o"), path, scenario=load_policy("ddpg-3v1o").scenario.replace(safety_filter="motion"))
+        export(load_policy("ddpg"), path, scenario=load_policy("ddpg").scenario.replace(safety_filter="motion"))
     with pytest.raises(PolicyError, match="its observations have the shape"):
         export(policy, path, scenario=policy.scenario.replace(motion_lag=0.0, safety_filter="voronoi"))
     assert not path.exists()

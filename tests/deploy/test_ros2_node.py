@@ -220,7 +220,7 @@ def stops(simulation, patience=PATIENCE):
 @needs_ros
 @pytest.mark.parametrize(("level", "message"), [("announce", "nav_msgs/Odometry"), ("off", "geometry_msgs/PoseStamped")])
 def test_five_nodes_in_lockstep_send_the_actions_of_a_rollout(level, message, ros):
-    policy = load_policy("ddpg-bc-5v2o")
+    policy = load_policy("flock")
     scenario = policy.scenario.replace(safety_filter=level, arena=0.5)
     started = ros("-p", "lockstep:=true", "-p", "timeout:=60", "-p", f"vehicle_message:={message}")
     simulation = Simulation(started, World(scenario), message)
@@ -336,11 +336,11 @@ def test_a_wrong_argument_is_one_line(arguments, message, loopback):
 
 @needs_ros
 def test_the_command_stops_the_vehicle_when_it_is_terminated(ros):
-    policy = load_policy("ddpg-3v1o")
+    policy = load_policy("ddpg")
     world = World(policy.scenario.replace(n_vehicles=1, n_obstacles=0))
     world.reset([episode_rng(0, 0)])
     simulation = Simulation(ros(), world)
-    with Processes(["ddpg-3v1o"], 1, "-p", "n_vehicles:=1", "-p", "n_obstacles:=0") as nodes:
+    with Processes(["ddpg"], 1, "-p", "n_vehicles:=1", "-p", "n_obstacles:=0") as nodes:
         assert simulation.wait_for(1)
         assert published_until(simulation, lambda: simulation.commands[0] and simulation.commands[0][-1][1] > 0)
         (output,) = nodes.terminate()
@@ -383,12 +383,12 @@ class Processes:
 @pytest.mark.timeout(1200)
 @pytest.mark.parametrize("seconds", [60, 600])
 def test_five_processes_at_10_hz_decide_as_a_rollout(seconds, ros, capsys):
-    policy = load_policy("ddpg-bc-5v2o")
+    policy = load_policy("flock")
     scenario = policy.scenario.replace(safety_filter="announce", max_cycles=10 * seconds)
     simulation = Simulation(ros(), World(scenario))
     settings = ("--set", "safety_filter=announce")
     lockstep = ("-p", "lockstep:=true", "-p", "timeout:=60", "-p", "announcement_wait:=1")
-    with Processes(["ddpg-bc-5v2o", *settings], 5, *lockstep) as nodes:
+    with Processes(["flock", *settings], 5, *lockstep) as nodes:
         assert simulation.wait_for(5, 2 * PATIENCE)
         start = time.monotonic()
         difference = largest_difference(simulation, policy, 10 * seconds, scenario.time_step)

@@ -71,21 +71,29 @@ def refresh(controller, now):
         body.receive(body.x, body.y, body.heading, now)
 
 
-@pytest.mark.parametrize("level", LEVELS)
-@pytest.mark.parametrize("name", ["ddpg-bc-5v2o", "crossing-5v2o"])
+ROUNDING = 5e-5
+"""In float32 a network's turn rate [rad/s] for one vehicle differs so much from the same in a batch."""
+
+
+@pytest.mark.parametrize(("name", "level"), [*(("flock", level) for level in LEVELS), ("ddpg", "announce")])
 def test_commands_are_those_of_the_world(name, level):
     policy = load_policy(name)
     scenario = policy.scenario.replace(safety_filter=level, arena=0.4)
-    assert max(differences(policy, scenario, 60)) < 1e-5
+    assert max(differences(policy, scenario, 60)) < ROUNDING
 
 
 def test_commands_are_those_of_the_world_with_shared_detections_and_a_filter_of_obstacles():
-    policy = load_policy("ddpg-5v2o")
+    policy = load_policy("ddpg")
     scenario = policy.scenario.replace(
         safety_filter="announce", obstacle_filter=True, shared_detections=True, arena=0.5, n_vehicles=7, n_obstacles=4
     )
+    assert max(differences(policy, scenario, 60)) < ROUNDING
+
+
+def test_commands_are_those_of_the_world_without_shared_detections():
+    policy = load_policy("flock")
     with pytest.warns(UserWarning, match="shared_detections"):
-        assert max(differences(policy, scenario, 60)) < 1e-5
+        assert max(differences(policy, policy.scenario.replace(shared_detections=False, arena=0.5), 60)) < ROUNDING
 
 
 def test_simulated_sensor_errors_are_not_added_to_poses():
@@ -185,7 +193,7 @@ def test_a_command_that_is_not_finite_is_an_error():
 
 
 def test_after_a_stop_motion_channels_start_anew():
-    policy = load_policy("ddpg-bc-5v2o")
+    policy = load_policy("flock")
     world = World(policy.scenario)
     world.reset([episode_rng(0, 0)])
     fresh, used = (VehicleController(policy, policy.scenario, 0, TIMEOUT) for _ in range(2))

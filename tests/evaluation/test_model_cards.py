@@ -7,7 +7,9 @@ import torch as th
 from sb3_flock import FlockDDPG, evaluate, load_policy, train
 from sb3_flock.config.training import TrainingConfig
 from sb3_flock.evaluation import model_cards
-from sb3_flock.evaluation.model_cards import median_of_seeds, read_card, ship
+from sb3_flock.evaluation.metrics import Metric
+from sb3_flock.evaluation.model_cards import over_seeds, read_card, ship
+from sb3_flock.evaluation.tasks import TASKS, with_bodies_of
 from sb3_flock.pretrained import shipped_policies
 from sb3_flock.serialization.load import PolicyError, find_policy
 from sb3_flock.serialization.migrate import FORMAT, migrate_config
@@ -16,26 +18,22 @@ from tests.helpers import quiet, tiny
 SHIPPED = sorted(shipped_policies())
 
 
-def test_policies_for_the_papers_setups_and_more_are_shipped():
-    setups = ("3v1o", "5v1o", "5v2o")
-    assert {
-        "general",
-        "crossing-5v2o",
-        *(f"{kind}-{setup}" for kind in ("ddpg", "ddpg-bc") for setup in setups),
-    } <= set(SHIPPED)
-
-
 @pytest.mark.parametrize("name", SHIPPED)
 def test_a_shipped_policy_behaves_as_its_card_says(name):
     policy, card = load_policy(name), read_card(name)
-    assert policy.path.stat().st_size < 1_000_000
+    assert policy.path.stat().st_size < 1_200_000
     check = card["check"]
     metrics = evaluate(policy, episodes=check["episodes"], seed=check["seed"])
     assert metrics["tracking_error"].mean == pytest.approx(check["tracking_error"], abs=0.003)
-    config, _ = migrate_config(TrainingConfig, card["config"], FORMAT)
+    config, _ = migrate_config(TrainingConfig, card["config"], card["format"])
     assert TrainingConfig(**config) == policy.config
     assert card["versions"] == policy.versions
     assert card["shipped_seed"] in [seed["seed"] for seed in card["seeds"]]
+    for seed in card["seeds"]:
+        assert list(seed["tasks"]) == list(TASKS)
+        own = [task for task, scenario in TASKS.items() if with_bodies_of(policy.scenario, scenario) == policy.scenario]
+        assert own  # it was trained for one of the tasks, whose results are thus in the card twice
+        assert all(seed["tasks"][task] == seed["metrics"] for task in own)
 
 
 def test_a_card_keeps_every_training_and_the_zip_is_the_best_ones(tmp_path, monkeypatch):
@@ -57,21 +55,40 @@ def test_a_card_keeps_every_training_and_the_zip_is_the_best_ones(tmp_path, monk
     model = FlockDDPG.load(path, device="cpu")  # SB3 reads it as before
     assert th.equal(model.policy.state_dict()["actor.mu.0.weight"], shipped.policy.state_dict()["actor.mu.0.weight"])
     errors = [evaluate(load_policy(run), episodes=3, seed=0)["tracking_error"].mean for run in runs]
-    assert median_of_seeds(card)["tracking_error"] == pytest.approx(np.median(errors), abs=1e-4)
+    over = over_seeds(card)["tracking_error"]
+    assert over.mean == pytest.approx(np.median(errors), abs=1e-4)
+    assert (over.low, over.high, over.n) == (pytest.approx(min(errors), abs=1e-4), pytest.approx(max(errors), abs=1e-4), 3)
+    assert card["format"] == FORMAT
+    crossing = with_bodies_of(original.scenario, TASKS["5v2o-crossing"])
+    recorded = card["seeds"][best]["tasks"]["5v2o-crossing"]["tracking_error"]
+    assert recorded == pytest.approx(evaluate(original, crossing, 3, seed=0)["tracking_error"].mean, abs=1e-4)
     assert len(card["seeds"][0]["curve"]["timesteps"]) == len(card["seeds"][0]["curve"]["return"]) == 5
     json.dumps(card, allow_nan=False)
 
 
-def test_a_card_without_a_metric_that_came_later_has_no_median_of_it():
+def test_over_seeds_are_the_median_the_lowest_and_the_highest_of_a_task():
+    card = {
+        "seeds": [
+            {"metrics": {"tracking_error": error}, "tasks": {"3v1o": {"tracking_error": 10 * error, "success_rate": 0.5}}}
+            for error in (0.3, 0.1, 0.15)
+        ]
+    }
+    assert over_seeds(card) == {"tracking_error": Metric(0.15, 0.1, 0.3, 3)}
+    assert over_seeds(card, "3v1o") == {"tracking_error": Metric(1.5, 1.0, 3.0, 3), "success_rate": Metric(0.5, 0.5, 0.5, 3)}
+    with pytest.raises(KeyError):
+        over_seeds(card, "5v1o")
+
+
+def test_a_metric_that_not_every_training_has_is_left_out():
     old = {"tracking_error": 0.1, "connectivity": None}
     card = {"seeds": [{"metrics": {**old, "violation_free_rate": 0.5}}, {"metrics": old}]}
-    assert median_of_seeds(card) == {"tracking_error": 0.1}
+    assert over_seeds(card) == {"tracking_error": Metric(0.1, 0.1, 0.1, 2)}
 
 
 def test_a_file_of_the_same_name_wins_over_a_shipped_policy(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert find_policy("ddpg-5v2o").parent.name == "pretrained"
-    (tmp_path / "ddpg-5v2o").write_bytes(b"mine")
-    assert find_policy("ddpg-5v2o").read_bytes() == b"mine"
-    with pytest.raises(PolicyError, match="nor one of .*ddpg-5v2o"):
+    assert find_policy("ddpg").parent.name == "pretrained"
+    (tmp_path / "ddpg").write_bytes(b"mine")
+    assert find_policy("ddpg").read_bytes() == b"mine"
+    with pytest.raises(PolicyError, match="nor one of .*ddpg"):
         find_policy("ddpg-9v9o")

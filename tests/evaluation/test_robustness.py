@@ -7,12 +7,13 @@ from sb3_flock import Scenario, load_policy
 from sb3_flock.cli import main
 from sb3_flock.evaluation.robustness import errors_table, evaluate_with_errors, sensor_errors
 
-SMALL = Scenario(max_cycles=100)
-
 
 @pytest.fixture(scope="module")
 def rows():
-    return evaluate_with_errors(load_policy("ddpg-3v1o"), SMALL, episodes=20)
+    """Without the safety filter, so that there are violations."""
+    policy = load_policy("ddpg")
+    unfiltered = policy.scenario.replace(n_vehicles=3, n_obstacles=1, max_cycles=100, safety_filter="off")
+    return evaluate_with_errors(policy, unfiltered, episodes=20)
 
 
 def test_a_policy_tracks_worse_with_much_noise_than_with_none(rows):

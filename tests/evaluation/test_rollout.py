@@ -76,7 +76,7 @@ class PredictsNothing:
     predict = None
 
 
-@pytest.mark.parametrize("policy", [object(), PredictsNothing(), None, "ddpg-3v1o"])
+@pytest.mark.parametrize("policy", [object(), PredictsNothing(), None, "ddpg"])
 def test_an_object_without_predict_is_refused_in_one_line(policy):
     needed = f"policy = {type(policy).__name__}: a Controller, or an object with SB3's predict, is needed"
     with pytest.raises(SettingsError) as error:
@@ -87,7 +87,7 @@ def test_an_object_without_predict_is_refused_in_one_line(policy):
 
 
 def test_a_loaded_policy_is_checked_against_the_scenario():
-    policy = load_policy("ddpg-3v1o")
+    policy = load_policy("ddpg")
     assert isinstance(as_controller(policy, policy.scenario), PolicyController)
     with pytest.raises(PolicyError, match="its observations have the shape"):
         as_controller(policy, policy.scenario.replace(n_anchors=9))

@@ -6,12 +6,12 @@ from stable_baselines3 import DDPG
 
 from sb3_flock import load_policy, make_vec_env
 from sb3_flock._renamed import POLICIES, RenamedWarning
+from sb3_flock.evaluation.model_cards import read_card
 from sb3_flock.pretrained import policy_path, shipped_policies
 from sb3_flock.serialization.load import PolicyError
 from sb3_flock.settings import SettingsError
 
-TASKS = ("3v1o", "5v1o", "5v2o")
-NAMES = {"crossing-5v2o", "general", *(f"{method}-{task}" for method in ("ddpg", "ddpg-bc") for task in TASKS)}
+NAMES = {"ddpg", "flock", "paper-plain"}
 
 
 def test_the_shipped_policies_have_their_names_and_a_model_card_each():
@@ -23,19 +23,21 @@ def test_the_shipped_policies_have_their_names_and_a_model_card_each():
 
 
 @pytest.mark.parametrize("name", sorted(NAMES))
-def test_each_shipped_policy_loads_by_name_for_the_task_in_its_name(name, tmp_path, monkeypatch):
+def test_each_shipped_policy_loads_by_name_for_its_task(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     policy = load_policy(name)
     assert policy.path == shipped_policies()[name]
-    assert policy.num_timesteps > 100_000
-    if name != "general":
-        vehicles, obstacles = policy.scenario.n_vehicles, policy.scenario.n_obstacles
-        assert name.endswith(f"{vehicles}v{obstacles}o")
-    assert bool(policy.scenario.motion_lag) == (name not in {f"ddpg-{task}" for task in TASKS})
-    assert (policy.config.algorithm.bc_coef > 0) == bool(policy.scenario.motion_lag)
+    assert 1000 < policy.num_timesteps <= max(seed["transitions"] for seed in read_card(name)["seeds"])
+    scenario = policy.scenario
+    assert (scenario.n_vehicles, scenario.n_obstacles, scenario.obstacle_motion) == (5, 2, "walk")
+    filtered = ("off", False) if name == "paper-plain" else ("announce", True)
+    assert (scenario.safety_filter, scenario.shared_detections) == filtered
+    assert bool(scenario.motion_lag) == (name == "flock")
+    assert (policy.config.algorithm.bc_coef > 0) == (name == "flock")
+    assert policy.config.train_env.expert == ("mpc" if name == "flock" else None)
 
 
-@pytest.mark.parametrize("name", ["ddpg-3v1o", "ddpg-bc-5v2o"])
+@pytest.mark.parametrize("name", ["ddpg", "flock"])
 @pytest.mark.parametrize("n_flocks", [1, 3])
 def test_sb3_loads_a_shipped_policy_and_learns_with_any_number_of_slots(name, n_flocks):
     env = make_vec_env(load_policy(name).scenario, n_flocks, seed=0)
@@ -46,25 +48,30 @@ def test_sb3_loads_a_shipped_policy_and_learns_with_any_number_of_slots(name, n_
 
 
 def test_the_path_of_a_shipped_policy():
-    assert policy_path("general") == shipped_policies()["general"]
-    with pytest.raises(SettingsError, match=r"policy = 'ddpg-3v10': one of .*general is needed; did you mean ddpg-3v1o\?"):
-        policy_path("ddpg-3v10")
+    assert policy_path("flock") == shipped_policies()["flock"]
+    with pytest.raises(
+        SettingsError, match=r"policy = 'flok': one of ddpg, flock, paper-plain is needed; did you mean flock\?"
+    ):
+        policy_path("flok")
+    assert set(POLICIES.values()) == {"ddpg", "flock"}
+    assert not NAMES & set(POLICIES)
     for old, new in POLICIES.items():
-        with pytest.warns(RenamedWarning, match=f"policy {old} is now {new}"):
+        with pytest.warns(RenamedWarning, match=f"policy {old} is now {new}, with its own task and the safety filter"):
             assert policy_path(old) == shipped_policies()[new]
 
 
 @pytest.mark.parametrize(("old", "new"), POLICIES.items())
 def test_a_policy_by_its_name_of_the_previous_release_warns_and_loads(old, new, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.warns(RenamedWarning, match=f"policy {old} is now {new}"):
+    with pytest.warns(RenamedWarning, match=f"policy {old} is now {new}, with its own task") as warned:
         assert load_policy(old).path == shipped_policies()[new]
+    assert [warning.filename for warning in warned] == [__file__]
 
 
 def test_a_file_or_a_folder_of_a_shipped_policys_name_comes_first(saved, monkeypatch):
     monkeypatch.chdir(saved.parent)
-    saved.rename("general")
-    assert load_policy("general").num_timesteps == 0
+    saved.rename("flock")
+    assert load_policy("flock").num_timesteps == 0
 
 
 def test_an_unknown_name_is_refused_with_all_names():

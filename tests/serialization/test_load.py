@@ -272,6 +272,9 @@ def test_files_of_plain_sb3_with_our_parts_load_without_trust(tmp_path, algorith
     expected = plain.predict(observations, deterministic=True)[0]
     np.testing.assert_array_equal(loaded.predict(observations)[0], expected)
     np.testing.assert_array_equal(trusted.predict(observations)[0], expected)
+    for read in (loaded, trusted):  # SB3 saves no task: the paper's is assumed, which has no filter
+        assert (read.scenario.safety_filter, read.scenario.shared_detections) == ("off", False)
+        assert read.scenario == Scenario(max_turn_rate=read.scenario.max_turn_rate, max_speed=read.scenario.max_speed)
 
 
 @pytest.mark.parametrize("trust", [False, True])
@@ -301,7 +304,7 @@ def test_loading_and_evaluating_imports_neither_torchs_compiler_nor_what_trains_
     code = """
 import sys
 from sb3_flock import evaluate, load_policy
-policy = load_policy("ddpg-3v1o")
+policy = load_policy("ddpg")
 evaluate(policy, policy.scenario.replace(max_cycles=2), episodes=1)
 slow = {"torch._dynamo", "sympy", "matplotlib", "pandas", "supersuit", "onnx", "ray", "sb3_flock.training.train"}
 sys.exit(f"imported: {slow & set(sys.modules)}" if slow & set(sys.modules) else 0)
@@ -323,7 +326,7 @@ def test_a_policy_that_computes_nan_is_refused_in_one_line(saved):
 # -- learning on -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("name", "n_flocks"), [("ddpg-3v1o", 1), ("ddpg-3v1o", 4), ("ddpg-bc-5v2o", 2)])
+@pytest.mark.parametrize(("name", "n_flocks"), [("ddpg", 1), ("ddpg", 4), ("flock", 2)])
 def test_a_shipped_policy_learns_on_with_any_number_of_slots(name, n_flocks):
     policy = load_policy(name)
     env = make_vec_env(policy.scenario.replace(n_vehicles=4), n_flocks, seed=0)
@@ -345,7 +348,7 @@ def test_a_shipped_policy_learns_on_with_any_number_of_slots(name, n_flocks):
 
 
 def test_behavior_cloning_stays_with_an_expert_that_is_queried():
-    policy = load_policy("ddpg-bc-3v1o")
+    policy = load_policy("flock")
     model = policy.to_model(
         expert_vec_env(policy.scenario), learning_starts=12, buffer_size=2000, batch_size=8, learning_rate=1e-5
     )
@@ -367,11 +370,11 @@ def test_what_does_not_fit_the_policy_is_refused_in_one_line(saved, tmp_path):
     with pytest.raises(PolicyError, match="trained without VecNormalize"):
         policy.to_model(VecNormalize(make_vec_env(n_flocks=1)))
     with pytest.raises(SettingsError, match="color is not a parameter"):
-        policy.to_model(make_vec_env(n_flocks=1), color="red")
+        policy.to_model(make_vec_env(policy.scenario, 1), color="red")
     with pytest.raises(SettingsError, match="algo and the networks are those of the file"):
-        policy.to_model(make_vec_env(n_flocks=1), features_dim=32)
+        policy.to_model(make_vec_env(policy.scenario, 1), features_dim=32)
     with pytest.warns(UserWarning, match="link_range = 0.15, evaluated with 0.2"):
-        policy.to_model(make_vec_env(Scenario(link_range=0.2), 1))
+        policy.to_model(make_vec_env(policy.scenario.replace(link_range=0.2), 1))
     plain = tmp_path / "plain.zip"
     DDPG(FlockPolicy, make_vec_env(n_flocks=1), buffer_size=10, device="cpu").save(plain)
     with pytest.warns(UserWarning, match="saved without its scenario"):

@@ -31,7 +31,7 @@ from sb3_flock.sim import Scenario
 from sb3_flock.training.checkpoint import LoadedCheckpoint
 from tests.helpers import DATA, SMALL_MODEL, quiet
 
-FORMAT_2 = DATA / "format_2"
+FORMAT_2, FORMAT_3 = DATA / "format_2", DATA / "format_3"
 
 OLD_CONFIG = """
 scenario:
@@ -77,6 +77,22 @@ SAME_CONFIG = {
     "n_eval_episodes": 12,
     "n_test_episodes": 34,
 }  # fmt: skip
+
+
+def with_earlier_defaults(values):
+    """The same values with the defaults of format 3 where format 4 has others."""
+    scenario, train_env = values.get("scenario", {}), values.get("train_env", {})
+    reward = {"link_bonus": 0.5, "lambda_": 0.7, **scenario.get("reward", {})}
+    then = {
+        "flock_sizes": (4,),
+        "extra_obstacles": 1,
+        "time_step_scale": 2.0,
+        "action_repeat": 1,
+        "separation_scale": 1.06,
+        "obstacle_separation_scale": None,
+    }
+    off = {"safety_filter": "off", "shared_detections": False}
+    return {**values, "scenario": {**off, **scenario, "reward": reward}, "train_env": {**then, **train_env}}
 
 
 # -- format numbers --------------------------------------------------------------------------------------------------
@@ -133,8 +149,9 @@ def test_migration_is_importable_without_torch():
 @pytest.mark.parametrize("number", range(1, FORMAT + 1))
 def test_every_old_key_of_a_config_is_renamed(number):
     current, renamed = migrate_config(TrainingConfig, yaml.safe_load(OLD_CONFIG), number)
-    assert current == SAME_CONFIG
-    assert TrainingConfig(**current) == TrainingConfig(**SAME_CONFIG)
+    expected_values = SAME_CONFIG if number == FORMAT else with_earlier_defaults(SAME_CONFIG)
+    assert current == expected_values
+    assert TrainingConfig(**current) == TrainingConfig(**expected_values)
     owners = ("Scenario", "TrainingConfig", "TrainEnvConfig", "MPCConfig", "AlgorithmConfig")
     expected = {pair for owner in owners for pair in FIELDS[owner].items()}
     names = {tuple(name.rsplit(".", 1)[-1] for name in pair) for pair in renamed}
@@ -154,7 +171,7 @@ def test_an_old_file_warns_in_one_line_and_means_the_same(tmp_path):
     path.write_text(OLD_CONFIG)
     with pytest.warns(RenamedWarning) as warned:
         config = load_config(TrainingConfig, path)
-    assert config == TrainingConfig(**SAME_CONFIG)
+    assert config == TrainingConfig(**with_earlier_defaults(SAME_CONFIG))
     (line,) = [str(warning.message) for warning in warned]
     _, renamed = migrate_config(TrainingConfig, yaml.safe_load(OLD_CONFIG), FORMAT)
     assert line.startswith(f"{path}: written by an earlier release (practice is now train_env, ")
@@ -192,6 +209,33 @@ def test_options_that_do_not_apply_are_not_dropped_from_a_present_config():
     current, _ = migrate_config(TrainingConfig, values, FORMAT)
     with pytest.raises(SettingsError, match="network.action_bound = 'tanh'"):
         TrainingConfig(**current)
+
+
+def test_a_config_of_format_3_keeps_the_defaults_of_then_and_one_without_a_number_has_the_present_ones(tmp_path):
+    path = tmp_path / "config.yaml"
+    text = "scenario:\n  n_vehicles: 4\n  reward: {epsilon: 2.0}\ntrain_env: {separation_scale: 1.01}\n"
+    path.write_text(text)
+    present = load_config(TrainingConfig, path)
+    assert (present.scenario.safety_filter, present.scenario.shared_detections) == ("announce", True)
+    assert present == TrainingConfig(**yaml.safe_load(text))
+    path.write_text(f"format: {FORMAT}\n{text}")
+    assert load_config(TrainingConfig, path) == present
+    path.write_text("format: 3\n" + text)
+    then = load_config(TrainingConfig, path)
+    assert then == TrainingConfig(**with_earlier_defaults(yaml.safe_load(text)))
+    assert (then.scenario.safety_filter, then.scenario.reward.epsilon, then.train_env.separation_scale) == ("off", 2, 1.01)
+
+
+def test_a_whole_config_of_format_3_is_unfiltered_unless_it_says_otherwise(tmp_path):
+    text = (FORMAT_3 / "run/config.yaml").read_text()
+    assert text.startswith("format: 3 ")
+    config = load_config(TrainingConfig, FORMAT_3 / "run/config.yaml")
+    assert (config.scenario.safety_filter, config.scenario.shared_detections) == ("off", False)
+    assert config.train_env.action_repeat == 1
+    assert config.train_env.time_step_scale == 2.0
+    path = tmp_path / "config.yaml"
+    path.write_text(text.replace("safety_filter: 'off'", "safety_filter: voronoi").replace("scale: 2.0", "scale: 1.0"))
+    assert load_config(TrainingConfig, path).scenario.safety_filter == "voronoi"
 
 
 @pytest.mark.parametrize(("n_vehicles", "size"), [(5, 4), (3, 3)])
@@ -262,9 +306,43 @@ def test_every_policy_of_format_2_loads_with_its_task_and_its_weights(name, tmp_
     state = policy.policy.state_dict()
     assert state.keys() == tensors.keys()
     assert all(th.equal(state[key], value) for key, value in tensors.items())
-    present = load_policy(POLICIES.get(name, name))  # as it is shipped now
-    observations = np.random.default_rng(0).random((9, *policy.scenario.observation_shape)).astype(np.float32)
-    np.testing.assert_array_equal(policy.predict(observations)[0], present.predict(observations)[0])
+    assert (policy.scenario.safety_filter, policy.scenario.shared_detections) == ("off", False)
+    assert policy.config.train_env.action_repeat == 1
+    assert name in POLICIES  # whoever asks for it by name is told what replaced it
+
+
+@pytest.mark.parametrize("name", ["unfiltered", "announce"])
+def test_a_policy_of_format_3_gives_the_episodes_it_gave_then(name):
+    policy = load_policy(FORMAT_3 / f"{name}.zip")
+    scenario, train_env = policy.scenario, policy.config.train_env
+    if name == "unfiltered":
+        assert (scenario.safety_filter, scenario.shared_detections, scenario.obstacle_radius) == ("off", False, None)
+    else:
+        assert (scenario.safety_filter, scenario.shared_detections) == ("announce", True)
+        assert scenario.obstacle_radius == scenario.detection_range  # null meant this range, also with shared detections
+    assert train_env.action_repeat == 1
+    results = rollout(PolicyController(policy), scenario.replace(max_cycles=100), 5, 7)
+    with np.load(FORMAT_3 / "rollouts.npz") as file:
+        expected = {key.split("/")[1]: file[key] for key in file.files if key.split("/")[0] == name}
+    assert len(expected) > 10
+    for metric, values in expected.items():
+        np.testing.assert_allclose(results[metric], values, rtol=1e-3, atol=1e-4, err_msg=metric)
+
+
+@pytest.mark.parametrize(
+    ("scenario", "radius"),
+    [
+        ({"shared_detections": True, "detection_range": 0.3}, 0.3),
+        ({"shared_detections": True, "obstacle_radius": None}, Scenario().detection_range),
+        ({"shared_detections": True, "obstacle_radius": 0.2}, 0.2),
+        ({"shared_detections": False, "detection_range": 0.3}, None),
+        ({}, None),
+    ],
+)
+def test_before_format_4_the_obstacle_channel_did_not_widen_with_shared_detections(scenario, radius):
+    for number in (1, 2, 3):
+        assert migrate_config(TrainingConfig, {"scenario": scenario}, number)[0]["scenario"].get("obstacle_radius") == radius
+    assert migrate_config(TrainingConfig, {"scenario": scenario}, FORMAT)[0]["scenario"] == scenario
 
 
 # -- checkpoints -----------------------------------------------------------------------------------------------------
@@ -286,10 +364,10 @@ def test_the_first_checkpoints_with_an_expert_held_its_noisy_action_alone():
     assert migrate_state({"taught": {"planned": 4}}, 2) == {"expert": {"next_actions": 4, "expert_actions": 4}}
 
 
-def copy_of_run(name, tmp_path):
-    folder = tmp_path / name
+def copy_of_run(run, tmp_path):
+    folder = tmp_path / run.name
     folder.mkdir()
-    for path in (FORMAT_2 / "runs" / name).iterdir():
+    for path in run.iterdir():
         (folder / path.name).write_bytes(path.read_bytes())
     return folder
 
@@ -301,7 +379,7 @@ def tensors_of(path):
 
 @pytest.mark.parametrize(("name", "checkpoint"), [("ddpg", "rl_model_400_steps"), ("ddpg_expert", "rl_model_402_steps")])
 def test_a_run_of_format_2_ends_as_the_release_that_began_it_ended_it(name, checkpoint, tmp_path):
-    folder = copy_of_run(name, tmp_path)
+    folder = copy_of_run(FORMAT_2 / "runs" / name, tmp_path)
     start = tensors_of(folder / f"{checkpoint}.zip")
     with pytest.warns(RenamedWarning, match="config.yaml"):
         result = resume(folder, quiet())
@@ -326,6 +404,18 @@ def test_a_run_of_format_2_ends_as_the_release_that_began_it_ended_it(name, chec
         rows = [int(row["time/total_timesteps"]) for row in csv.DictReader(file) if row["time/total_timesteps"]]
     assert rows[0] < 450
     assert rows[-1] >= 1000
+
+
+def test_a_run_of_format_3_goes_on_without_a_filter(tmp_path):
+    folder = copy_of_run(FORMAT_3 / "run", tmp_path)
+    start = tensors_of(folder / "rl_model_304_steps.zip")
+    result = resume(folder, quiet())
+    assert (result.config.scenario.safety_filter, result.config.train_env.action_repeat) == ("off", 1)
+    expected, ended = tensors_of(FORMAT_3 / "unfiltered.zip"), tensors_of(folder / "final_model.zip")
+    distance, learned = (
+        sum(float((tensors[key] - expected[key]).square().sum()) for key in expected) ** 0.5 for tensors in (ended, start)
+    )
+    assert distance < 0.01 * learned
 
 
 def test_a_migrated_policy_saved_again_has_the_present_format(model, tmp_path):

@@ -26,6 +26,7 @@ from sb3_flock.sweep.config import load_sweep
 from tests.helpers import SMALL_MODEL
 
 DATA = Path(__file__).parent.parent / "data"
+FORMAT_3 = DATA / "format_3"
 POLICIES = sorted((DATA / "format_2" / "policies").glob("*.zip"))
 
 
@@ -215,14 +216,14 @@ def test_the_files_mode_stays(tmp_path):
 # -- model cards -------------------------------------------------------------------------------------------------------
 
 
-def test_a_card_gets_the_present_names_and_keeps_the_rest(tmp_path):
+def test_a_card_gets_the_present_format_and_keeps_the_rest(tmp_path):
     policy = load_policy(next(path for path in POLICIES if path.stem == "second-look-5v2o"))
     card = {"name": "second-look-5v2o", "seeds": [{"seed": 0, "metrics": {"return": -3.8}}], "other": 0.1}
     path = tmp_path / "card.json"
     path.write_text(json.dumps({**card, "config": member(policy.path)["config"]}))
     assert rewrite(path)
     new = json.loads(path.read_text())
-    assert new == {**card, "name": "ddpg-bc-5v2o", "config": policy.config.model_dump(mode="json")}
+    assert new == {**card, "format": FORMAT, "config": policy.config.model_dump(mode="json")}
     content = path.read_bytes()
     assert not rewrite(path)
     assert path.read_bytes() == content
@@ -255,7 +256,7 @@ def test_a_whole_config_is_written_with_every_comment(run, tmp_path):
     assert not rewrite(path)
 
 
-def test_a_part_of_a_config_keeps_its_keys_and_leading_comments(tmp_path):
+def test_a_part_of_a_config_keeps_its_keys_and_leading_comments_and_says_what_was_the_default(tmp_path):
     path = tmp_path / "config.yaml"
     text = (
         "# mine\nlearner: # a comment\n  guidance: 10.0\n  gamma: 0.9\npractice:\n  teacher: foresight\n  vehicles: [3, 5]\n"
@@ -265,11 +266,11 @@ def test_a_part_of_a_config_keeps_its_keys_and_leading_comments(tmp_path):
         config = load_config(TrainingConfig, path)
     assert rewrite(path)
     assert path.read_text().startswith("# mine\nalgorithm:")
-    assert yaml.safe_load(path.read_text()) == {
-        "algorithm": {"bc_coef": 10.0, "gamma": 0.9},
-        "train_env": {"expert": "mpc", "flock_sizes": [3, 5]},
-        "seed": 1,
-    }
+    values = yaml.safe_load(path.read_text())
+    assert list(values) == ["algorithm", "train_env", "seed", "scenario"]
+    assert values["algorithm"] == {"bc_coef": 10.0, "gamma": 0.9}
+    assert values["train_env"].items() >= {"expert": "mpc", "flock_sizes": [3, 5], "action_repeat": 1}.items()
+    assert values["scenario"].items() >= {"safety_filter": "off", "shared_detections": False}.items()
     assert load_config(TrainingConfig, path) == config
     assert not rewrite(path)
 
@@ -286,7 +287,37 @@ def test_a_number_of_the_format_is_raised(tmp_path):
     path = tmp_path / "config.yaml"
     path.write_text("format: 2\nseed: 1\n")
     assert rewrite(path)
-    assert yaml.safe_load(path.read_text()) == {"format": FORMAT, "seed": 1}
+    values = yaml.safe_load(path.read_text())
+    assert (values["format"], values["seed"], values["scenario"]["safety_filter"]) == (FORMAT, 1, "off")
+    assert not rewrite(path)
+
+
+def test_files_of_format_3_are_rewritten_with_the_task_that_they_had(tmp_path):
+    policy, config = copy(FORMAT_3 / "announce.zip", tmp_path), copy(FORMAT_3 / "run" / "config.yaml", tmp_path)
+    before = load_config(TrainingConfig, config)
+    assert rewrite(policy)
+    assert rewrite(config)
+    assert member(policy)["format"] == FORMAT
+    assert load_policy(policy).config == load_policy(FORMAT_3 / "announce.zip").config
+    np.testing.assert_array_equal(predictions(policy), predictions(FORMAT_3 / "announce.zip"))
+    assert config.read_text() == to_yaml(before)
+    assert load_config(TrainingConfig, config) == before
+    assert before.scenario.safety_filter == "off"
+
+
+def test_a_card_without_a_format_is_of_format_3(tmp_path):
+    path = tmp_path / "card.json"
+    config = member(FORMAT_3 / "unfiltered.zip")["config"]
+    for leaves_out in ("safety_filter", "shared_detections"):
+        config["scenario"].pop(leaves_out)
+    path.write_text(json.dumps({"name": "mine", "seeds": [], "config": config}))
+    assert rewrite(path)
+    card = json.loads(path.read_text())
+    assert (card["name"], card["format"], card["config"]["scenario"]["safety_filter"]) == ("mine", FORMAT, "off")
+    assert not rewrite(path)
+    path.write_text(json.dumps({**card, "format": FORMAT + 1}))
+    with pytest.raises(SettingsError, match=f"format = {FORMAT + 1}: this version reads formats 1 to {FORMAT}"):
+        rewrite(path)
 
 
 @pytest.mark.parametrize(
@@ -332,7 +363,7 @@ def test_a_sweep_of_a_shipped_policy_gets_its_present_name(tmp_path):
     path = tmp_path / "sweep.yaml"
     path.write_text("policy: paper-5v2o\ngrid:\n  n_vehicles: [1, 2]\n")
     assert rewrite(path)
-    assert yaml.safe_load(path.read_text()) == {"policy": "ddpg-5v2o", "grid": {"n_vehicles": [1, 2]}}
+    assert yaml.safe_load(path.read_text()) == {"policy": "ddpg", "grid": {"n_vehicles": [1, 2]}}
 
 
 # -- the warning of a file that was not rewritten -----------------------------------------------------------------------

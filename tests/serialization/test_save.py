@@ -97,7 +97,7 @@ def test_a_model_that_flies_on_normalized_observations_is_refused_in_one_line(tm
 DIFFERENT = {
     "n_anchors": (9, "scenario.n_anchors = 9, observations of shape (3, 9, 9): the model's have (3, 11, 11)"),
     "motion_lag": (0.2, "scenario.motion_lag = 0.2, observations of shape (6, 11, 11): the model's have (3, 11, 11)"),
-    "max_speed": (0.3, "scenario.max_speed = 0.3: the model's actions are Box([ 0."),
+    "max_speed": (0.1, "scenario.max_speed = 0.1: the model's actions are Box([ 0."),
     "max_turn_rate": (1.0, "scenario.max_turn_rate = 1.0: the model's actions are Box([ 0."),
     "algo": ("sac", "algo = sac, whose policy is a FlockSACPolicy: the model's is a FlockPolicy"),
     "features_dim": (32, "network.features_dim = 32: the model has 16"),

@@ -174,9 +174,9 @@ def test_a_policy_over_a_grid_has_the_metrics_of_evaluate(tmp_path):
     from sb3_flock import evaluate
 
     file, out = sweep_file(tmp_path, "grid: {n_vehicles: [1, 4], seed: [3]}\n"), tmp_path / "out"
-    code, _, errors = Sweep(file, "--evaluate", "ddpg-3v1o", "--episodes", "5", "--output", out).end()
+    code, _, errors = Sweep(file, "--evaluate", "ddpg", "--episodes", "5", "--output", out).end()
     assert code == 0, errors
-    policy = load_policy("ddpg-3v1o")
+    policy = load_policy("ddpg")
     for row in results(out):
         expected = evaluate(policy, policy.scenario.replace(n_vehicles=int(row["scenario.n_vehicles"])), 5, 3)
         assert float(row["tracking_error"]) == pytest.approx(expected["tracking_error"].mean, rel=1e-12)
@@ -192,11 +192,11 @@ def test_a_policy_over_a_grid_has_the_metrics_of_evaluate(tmp_path):
         (["--output", "strange://x"], "--output strange://x: Protocol not known: strange"),
         (["--evaluate", "nobody"], "nobody: no such file or run folder"),
         (
-            ["--evaluate", "general", "--set", "n_anchors=7"],
-            "general.zip: its observations have the shape (6, 11, 11), the scenario's (n_anchors = 7, motion_lag = 0.2) have "
+            ["--evaluate", "flock", "--set", "n_anchors=7"],
+            "flock.zip: its observations have the shape (6, 11, 11), the scenario's (n_anchors = 7, motion_lag = 0.2) have "
             "(6, 7, 7)",
         ),
-        (["--evaluate", "general", "--set", "gamma=0.5"], "algorithm.gamma does not affect an evaluation"),
+        (["--evaluate", "flock", "--set", "gamma=0.5"], "algorithm.gamma does not affect an evaluation"),
         (["--episodes", "3"], "--episodes 3: only with --evaluate"),
         (["--resume", "x"], "a FILE or --resume DIR is needed, and not both"),
     ],

@@ -74,8 +74,8 @@ def test_any_other_error_is_for_ray_to_try_again(reported, monkeypatch):
 
 
 def test_a_policy_is_evaluated_from_the_bytes_of_its_zip(reported):
-    config = load_sweep("", text="grid: {scenario.n_vehicles: [2]}", policy="ddpg-3v1o", episodes=3)
-    zipped = shipped_policies()["ddpg-3v1o"].read_bytes()
+    config = load_sweep("", text="grid: {scenario.n_vehicles: [2]}", policy="ddpg", episodes=3)
+    zipped = shipped_policies()["ddpg"].read_bytes()
     trials.evaluate_trial({"scenario.n_vehicles": 2}, config.model_dump(mode="json"), zipped)
     ((row, _),) = reported
     assert row["status"] == "done"

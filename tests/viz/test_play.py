@@ -177,12 +177,13 @@ def test_an_episode_has_no_end(game):
 def test_policies_and_controllers_with_memory_continue_while_the_flock_changes():
     late = SensorErrors(position_noise=0.01, delay=0.2)
     for policy, changes in (
-        (load_policy("ddpg-5v2o"), {}),
-        (load_policy("ddpg-5v2o"), {"sensors": late}),
-        (load_policy("general"), {"motion_lag": 0.2}),
+        (load_policy("ddpg"), {}),
+        (load_policy("ddpg"), {"sensors": late}),
+        (load_policy("flock"), {"motion_lag": 0.2}),
         (make_controller("orca"), {}),
     ):
-        game = Game(policy, Scenario(n_vehicles=2, n_obstacles=1, **changes))
+        task = getattr(policy, "scenario", Scenario())  # a policy's own, a controller has none
+        game = Game(policy, task.replace(n_vehicles=2, n_obstacles=1, **changes))
         for key in (pygame.K_PLUS, pygame.K_PLUS, pygame.K_v, pygame.K_MINUS):
             press(game, key)
             game.step()

@@ -123,7 +123,7 @@ def test_an_older_video_stays_if_the_simulation_fails(tmp_path):
 
 def test_the_command(tmp_path, capsys):
     path = tmp_path / "episode.gif"
-    words = ["render", "ddpg-3v1o", "--n-vehicles", "2", "--set", "max_cycles=3", "--output", str(path)]
+    words = ["render", "ddpg", "--n-vehicles", "2", "--set", "max_cycles=3", "--output", str(path)]
     assert main(words) == 0
     assert capsys.readouterr().out == f"{path}\n"
     with Image.open(path) as video:
@@ -131,4 +131,4 @@ def test_the_command(tmp_path, capsys):
     assert main(["render", "--output", str(path)]) == 2
     assert "a POLICY or --controller NAME is needed" in capsys.readouterr().err
     with pytest.raises(SystemExit, match="2"):
-        main(["render", "ddpg-3v1o"])
+        main(["render", "ddpg"])

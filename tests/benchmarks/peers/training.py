@@ -4,7 +4,7 @@ Run by the Python of the peers' own environment (requirements.txt beside this fi
 JSON::
 
     python training.py iddpg --vehicles 5 --flocks 8 --batch 128 --utd-ratio 0.2 --seconds 60
-    python training.py updates --config configs/ddpg_bc_5v2o.yaml --batch 256
+    python training.py updates --config configs/flock.yaml --batch 256
 
 ``iddpg`` and ``maddpg`` are BenchMARL's, on its VMAS flocking task: DDPG with one policy for all agents, whose critic sees
 one agent or all of them. ``sbx`` is the DDPG of SBX (JAX) on sb3_flock's own vector env. A transition is one step of one
