@@ -15,6 +15,7 @@ EXPERT_PRESETS: dict[str, dict[str, Any]] = {
         "train_env.flock_sizes": None,  # as in the task
         "train_env.extra_obstacles": 1,
         "train_env.action_repeat": 1,
+        "train_env.separation_scale": 1.02,
         "train_env.obstacle_separation_scale": 1.18,
         "train_env.mpc.max_link_length": 0.85,
         "train_env.mpc.link_cutoff": 1.0,

@@ -53,7 +53,7 @@ class TrainEnvConfig(Settings):
     )
     time_step_scale: Positive = Field(1.0, description="factor on the sampling period (paper: 1)")
     action_repeat: int = Field(2, ge=1, le=1000, description="sampling periods for which an action is repeated (paper: 1)")
-    separation_scale: float = Field(1.02, ge=1, le=1e6, description="factor on the minimum separations (paper: 1)")
+    separation_scale: float = Field(1.015, ge=1, le=1e6, description="factor on the minimum separations (paper: 1)")
     obstacle_separation_scale: float | None = Field(
         1.08, ge=1, le=1e6, description="the same for obstacles; null: separation_scale (paper: 1)"
     )

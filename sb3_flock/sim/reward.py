@@ -49,7 +49,7 @@ def register_reward_term(name: str) -> Callable[[RewardTerm], RewardTerm]:
 class RewardWeights(Settings):
     """The weights of the reward. The paper's plain sum is in ``configs/paper_plain.yaml``: weights of 1."""
 
-    link_bonus: NotNegative = Field(1.0, description="reward for each neighbor at a safe distance (paper: 1)")
+    link_bonus: NotNegative = Field(1.5, description="reward for each neighbor at a safe distance (paper: 1)")
     separation_penalty: NotNegative = Field(
         6.0, description="penalty for each neighbor nearer than neighbor_separation (paper: 1)"
     )
