@@ -12,7 +12,7 @@ from sb3_flock.controllers import EXPERTS
 from sb3_flock.controllers.mpc import MPCConfig
 from sb3_flock.rl.registry import ModelSettings
 from sb3_flock.rl.settings import Count, Width
-from sb3_flock.settings import NotNegative, Positive, Settings, suggest
+from sb3_flock.settings import NotNegative, Positive, Settings, SettingsError, suggest
 from sb3_flock.sim import Scenario
 from sb3_flock.sim.dynamics import MAX_BODIES, ObstacleMotion
 
@@ -97,17 +97,28 @@ class TaskConfig(Settings):
         return {**TRAINING_TASK, **value} if isinstance(value, Mapping) else value
 
     @model_validator(mode="after")
-    def _lag_fits_the_training_env(self) -> TaskConfig:
+    def _training_env_is_possible(self) -> TaskConfig:
         steps = self.scenario.motion_lag_steps / self.train_env.time_step_scale
         if not math.isclose(steps, round(steps), rel_tol=1e-6) or (self.scenario.motion_lag and steps < 0.5):
             step = f"{self.scenario.time_step * self.train_env.time_step_scale:g} s, the training env's sampling period"
             raise ValueError(f"motion_lag = {self.scenario.motion_lag}: input should be a multiple of {step}")
+        try:
+            for scenario in self.training_scenarios():
+                self.training_safety(scenario)
+        except SettingsError as error:
+            scale = self.train_env.time_step_scale
+            raise ValueError(f"train_env.time_step_scale = {scale}: in the training env {error}") from None
         return self
 
     def training_scenarios(self) -> list[Scenario]:
-        """The scenarios of the training env: ``scenario`` changed as ``train_env`` says, one for each flock size."""
+        """The scenarios of the training env: ``scenario`` changed as ``train_env`` says, one for each flock size.
+
+        The safety filter is off in them; :meth:`training_safety` has its settings.
+        """
         scenario, train_env = self.scenario, self.train_env
         changed = scenario.replace(
+            safety_filter="off",
+            obstacle_filter=False,
             time_step=scenario.time_step * train_env.time_step_scale,
             max_cycles=max(1, round(scenario.max_cycles / train_env.time_step_scale)),
             n_obstacles=scenario.n_obstacles + (train_env.extra_obstacles if scenario.n_obstacles else 0),
@@ -132,8 +143,8 @@ class TaskConfig(Settings):
 
         The wider ones are for the reward and the expert. The filter would hold vehicles that keep just those.
         """
-        task = self.scenario
-        return scenario.replace(neighbor_separation=task.neighbor_separation, obstacle_separation=task.obstacle_separation)
+        names = ("safety_filter", "obstacle_filter", "neighbor_separation", "obstacle_separation")
+        return scenario.replace(**{name: getattr(self.scenario, name) for name in names})
 
 
 class TrainingConfig(ModelSettings, TaskConfig):

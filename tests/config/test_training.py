@@ -72,7 +72,7 @@ def test_with_every_change_switched_off_the_training_env_is_the_task():
         obstacle_separation_scale=1.0,
     )
     config = TaskConfig(train_env=train_env)
-    (same,) = config.training_scenarios()
+    (same,) = map(config.training_safety, config.training_scenarios())
     assert same == config.scenario.replace(obstacle_arena=config.scenario.obstacle_half_side)
 
 
@@ -159,12 +159,12 @@ def test_a_whole_scenario_stays_as_it_is():
     [
         ({"max_speed": 0.5}, "link_range = 0.15: safety_filter needs more than neighbor_separation"),
         ({"link_range": 0.1}, "link_range = 0.1: safety_filter needs more than neighbor_separation"),
-        ({"time_step_scale": 2.0}, "link_range = 0.15: safety_filter needs more than neighbor_separation"),
+        ({"time_step_scale": 2.0}, "time_step_scale = 2.0: in the training env link_range = 0.15: safety_filter needs more than neighbor_separation"),
     ],
 )
 def test_a_task_whose_ranges_do_not_fit_the_filter_is_one_line_that_says_that_it_can_be_off(overrides, named):
     with pytest.raises(SettingsError, match=named) as error:
-        load_config(TrainingConfig, overrides=overrides).training_scenarios()
+        load_config(TrainingConfig, overrides=overrides)
     assert str(error.value).endswith("; it can be off")
     assert "\n" not in str(error.value)
     assert load_config(TrainingConfig, overrides={**overrides, "safety_filter": "off"}).training_scenarios()
@@ -176,10 +176,11 @@ def test_a_config_is_importable_without_torch():
 
 
 def test_the_filter_of_a_training_env_keeps_the_tasks_separations():
-    config = load_config(TrainingConfig, overrides={"separation_scale": 1.05, "safety_margin": 0.01, "n_vehicles": 7})
+    config = load_config(TrainingConfig, overrides={"separation_scale": 1.3, "safety_margin": 0.01, "n_vehicles": 7})
     (scenario,) = config.training_scenarios()
     safety = config.training_safety(scenario)
-    assert scenario.neighbor_separation == pytest.approx(0.105)
+    assert scenario.neighbor_separation == pytest.approx(0.13)
     assert (safety.neighbor_separation, safety.obstacle_separation, safety.safety_margin) == (0.1, 0.15, 0.01)
-    same = {"neighbor_separation", "obstacle_separation"}
+    assert (scenario.safety_filter, safety.safety_filter) == ("off", "announce")
+    same = {"neighbor_separation", "obstacle_separation", "safety_filter"}
     assert all(getattr(safety, name) == getattr(scenario, name) for name in set(type(safety).model_fields) - same)
