@@ -11,7 +11,7 @@ import inspect
 import numbers
 import reprlib
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeVar, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeVar, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
@@ -86,6 +86,9 @@ class Settings(_Model):
         values, renamed = rename_fields(type(self).__name__, values)
         for old, new in renamed:
             warn_renamed(f"{type(self).__name__}: {old}", new, stacklevel=2)
+        for name, value in values.items():
+            if isinstance(value, bool) and name in type(self).model_fields:
+                _refuse_as_number(name, value, type(self).model_fields[name].annotation)
         try:
             super().__init__(**values)
         except ValidationError as error:
@@ -103,6 +106,16 @@ class Settings(_Model):
         :raises SettingsError: for an unknown name or a value that is not accepted
         """
         return type(self)(**{**{name: getattr(self, name) for name in type(self).model_fields}, **changes})
+
+
+def _refuse_as_number(name: str, value: bool, annotation: Any) -> None:
+    """Pydantic takes ``True`` for 1.
+
+    :raises SettingsError: if the field takes numbers and no booleans
+    """
+    kinds = get_args(annotation) or (annotation,)
+    if bool not in kinds and any(kind in (int, float) for kind in kinds):
+        raise SettingsError(f"{name} = {value}: input should be a number")
 
 
 def check_integer(name: str, value: Any, least: int) -> None:

@@ -20,7 +20,7 @@ TRAINING_TASK: dict[str, Any] = {"safety_filter": "announce", "shared_detections
 """What a training's task has, unless it says otherwise, in place of the defaults of :class:`~sb3_flock.sim.Scenario`, which are
 the paper's."""
 
-Sizes = Annotated[tuple[Width, ...], BeforeValidator(lambda value: (value,) if isinstance(value, int) else value)]
+Sizes = Annotated[tuple[Width, ...], BeforeValidator(lambda value: (value,) if type(value) is int else value)]
 """One or several; a number alone is one."""
 
 

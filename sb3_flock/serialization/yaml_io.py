@@ -22,21 +22,50 @@ _Settings = TypeVar("_Settings", bound=Settings)
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML's safe loader, which also reads 1e-3 as a number and 1e5 as an integer; in YAML 1.1 they are strings."""
+    """YAML's safe loader with the scalars of YAML 1.2, and without keys that occur twice.
+
+    PyYAML reads YAML 1.1, in which ``yes`` and ``off`` are booleans, ``1:30`` is 90, ``010`` is 8, ``1e-3`` is text and
+    ``2024-01-01`` is a date. Here they are text, text, 10, a number and text.
+    """
+
+    yaml_implicit_resolvers = {}  # noqa: RUF012 - instead of those of YAML 1.1
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """The mapping of a node.
+
+        :raises SettingsError: for a key that occurs twice
+        """
+        seen = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and key.tag != _MERGE:
+                if key.value in seen:
+                    raise SettingsError(f"{format_value(key.value)} is given twice, again in line {key.start_mark.line + 1}")
+                seen.add(key.value)
+        return super().construct_mapping(node, deep)
+
+    def construct_number(self, node: yaml.ScalarNode) -> float | int:
+        """An integer, also one that is written as ``1e5``, or a float."""
+        text = node.value.replace("_", "").lower()
+        value = float(text.replace(".inf", "inf").replace(".nan", "nan"))
+        whole = re.fullmatch(r"[-+]?[0-9]+(e\+?[0-9]+)?", text) and math.isfinite(value)
+        return (int(text) if "e" not in text else int(value)) if whole else value
 
 
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(r"^[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]+$"), list("-+.0123456789")
-)
-_WHOLE = re.compile(r"[-+]?[0-9]+[eE]\+?[0-9]+")
-
-
-def _read_float(loader: _Loader, node: yaml.ScalarNode) -> float | int:
-    value: float = loader.construct_yaml_float(node)
-    return int(value) if _WHOLE.fullmatch(node.value) and math.isfinite(value) else value
-
-
-_Loader.add_constructor("tag:yaml.org,2002:float", _read_float)
+_MERGE = "tag:yaml.org,2002:merge"
+for _tag, _pattern, _first in (
+    ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
+    ("bool", r"true|True|TRUE|false|False|FALSE", list("tTfF")),
+    ("int", r"[-+]?[0-9][0-9_]*", list("-+0123456789")),
+    (
+        "float",
+        r"[-+]?([0-9][0-9_]*\.?[0-9_]*|\.[0-9][0-9_]*)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
+        list("-+.0123456789"),
+    ),
+    ("merge", r"<<", ["<"]),
+):
+    _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"^(?:{_pattern})$"), _first)
+for _tag in ("int", "float"):
+    _Loader.add_constructor(f"tag:yaml.org,2002:{_tag}", _Loader.construct_number)
 
 
 def load_config(
@@ -87,6 +116,8 @@ def parse_overrides(assignments: Iterable[str]) -> dict[str, Any]:
             raise SettingsError(f"{assignment}: KEY=VALUE is needed, such as reward.lambda_=0.5")
         try:
             overrides[key] = yaml.load(text, _Loader)
+        except SettingsError as error:
+            raise SettingsError(f"{assignment}: {error}") from None
         except (yaml.YAMLError, ValueError):
             raise SettingsError(f"{assignment}: the value is not YAML") from None
     return overrides
@@ -119,6 +150,8 @@ def read_yaml(path: Path, text: str | None = None) -> dict[str, Any]:
         values = yaml.load(path.read_text(encoding="utf-8") if text is None else text, _Loader)
     except OSError as error:
         raise SettingsError(f"config {path}: {error.strerror or error}") from None
+    except SettingsError as error:
+        raise SettingsError(f"config {path}: {error}") from None
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise SettingsError(f"config {path}: not a YAML file ({' '.join(str(error).split())})") from None
     if values is None:

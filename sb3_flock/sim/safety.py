@@ -49,7 +49,7 @@ class SafetySettings(SensingSettings, SensorSettings):
     @field_validator("safety_filter", mode="before")
     @classmethod
     def _off_is_a_word(cls, value: Any) -> Any:
-        """YAML reads ``off`` as false."""
+        """PyYAML reads ``off`` as false."""
         return "off" if value is False else value
 
     @model_validator(mode="after")

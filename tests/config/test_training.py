@@ -159,7 +159,10 @@ def test_a_whole_scenario_stays_as_it_is():
     [
         ({"max_speed": 0.5}, "link_range = 0.15: safety_filter needs more than neighbor_separation"),
         ({"link_range": 0.1}, "link_range = 0.1: safety_filter needs more than neighbor_separation"),
-        ({"time_step_scale": 2.0}, "time_step_scale = 2.0: in the training env link_range = 0.15: safety_filter needs more than neighbor_separation"),
+        (
+            {"time_step_scale": 2.0},
+            "time_step_scale = 2.0: in the training env link_range = 0.15: safety_filter needs more than neighbor_separation",
+        ),
     ],
 )
 def test_a_task_whose_ranges_do_not_fit_the_filter_is_one_line_that_says_that_it_can_be_off(overrides, named):

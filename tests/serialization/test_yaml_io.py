@@ -53,7 +53,13 @@ def test_overrides_are_yaml_and_1e_3_is_a_number():
         ("a: [", "not a YAML file"),
         ("!!python/object/apply:os.system ['true']", "not a YAML file"),
         ("algo: ppo\n", "algo = 'ppo'"),
-        ("output_dir: 2021-13-45\n", "not a YAML file"),
+        ("seed: 1\nalgo: td3\nseed: 2\n", "config .*: 'seed' is given twice, again in line 3"),
+        ("scenario:\n  reward: {beta: -1, beta: -2}\n", "'beta' is given twice, again in line 2"),
+        ("total_timesteps: 1:30\n", "total_timesteps = '1:30': input should be a valid integer"),
+        ("scenario: {n_vehicles: yes}\n", "scenario.n_vehicles = 'yes': input should be a valid integer"),
+        ("scenario: {n_vehicles: true}\n", "scenario.n_vehicles = True: input should be a number"),
+        ("algorithm: {gamma: false}\n", "algorithm.gamma = False: input should be a number"),
+        ("train_env: {flock_sizes: true}\n", "train_env.flock_sizes = True: input should be a valid tuple"),
         ("scenario: &a\n  reward: *a\n", "reward"),
         ("network:\n  net_arch: [-1]\n", "net_arch"),
         ("seed: 4294967296\n", "seed = 4294967296"),
@@ -71,10 +77,19 @@ def test_a_missing_file_is_one_line(tmp_path):
         load_config(TrainingConfig, tmp_path / "none.yaml")
 
 
-@pytest.mark.parametrize("assignment", ["gamma", "=3", "gamma=[", "gamma=2021-13-45"])
+@pytest.mark.parametrize("assignment", ["gamma", "=3", "gamma=[", "gamma={a: 1, a: 2}", "gamma=!!python/name:os.system x"])
 def test_a_wrong_override_is_one_line(assignment):
-    with pytest.raises(SettingsError, match="KEY=VALUE is needed|the value is not YAML"):
+    with pytest.raises(SettingsError, match="KEY=VALUE is needed|the value is not YAML|is given twice"):
         parse_overrides([assignment])
+
+
+def test_scalars_are_those_of_yaml_1_2():
+    words = {"yes": "yes", "off": "off", "1:30": "1:30", "010": 10, "2024-01-01": "2024-01-01", "true": True, "~": None}
+    numbers = {"1e5": 100_000, "1_000": 1000, "-3": -3, ".5": 0.5, "1.": 1.0, "2.5e-3": 0.0025, ".inf": float("inf")}
+    for text, value in {**words, **numbers}.items():
+        read = parse_overrides([f"a={text}"])["a"]
+        assert (read, type(read)) == (value, type(value)), text
+    assert parse_overrides(["a={b: {x: 1, <<: {x: 2, y: 3}}}"]) == {"a": {"b": {"x": 1, "y": 3}}}
 
 
 def test_yaml_is_plain():
