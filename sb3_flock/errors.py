@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 
+def printable(text: str) -> str:
+    """The text with ``?`` in place of every letter that does not print, such as a line feed or an escape sequence."""
+    return "".join(letter if letter.isprintable() else "?" for letter in text)
+
+
 class UserError(ValueError):
     """A mistake that the user can correct; the message is one printable line, whatever a file or a flag put into it."""
 
     def __init__(self, message: str) -> None:
-        super().__init__("".join(letter if letter.isprintable() else "?" for letter in message[:_MAX_MESSAGE]))
+        super().__init__(printable(message[:_MAX_MESSAGE]))
 
 
 _MAX_MESSAGE = 2000

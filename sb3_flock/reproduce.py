@@ -13,6 +13,7 @@ import numpy as np
 from rich.console import Console
 
 from sb3_flock.config.training import TrainingConfig
+from sb3_flock.console import PlainConsole
 from sb3_flock.controllers import CONTROLLERS, Controller, make_controller
 from sb3_flock.envs.vec_env import make_vec_env
 from sb3_flock.evaluation import robustness
@@ -113,7 +114,7 @@ def reproduce(out: str | Path, quick: bool = False, console: Console | None = No
     :raises SettingsError: if matplotlib is missing or the folder cannot be written
     """
     check_matplotlib()
-    size, console = QUICK if quick else FULL, console or Console(stderr=True)
+    size, console = QUICK if quick else FULL, console or PlainConsole(stderr=True)
     folder = Path(out)
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -44,11 +44,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     with warnings_as_lines():
-        options = _parse(words)
         try:
-            return int(options.run(options, words))
+            try:
+                options = _parse(words)
+                return int(options.run(options, words))
+            finally:  # what was printed is written, or an error, now: at the end of the process Python would show a traceback
+                sys.stdout.flush()
         except BrokenPipeError:
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            _discard_output()
+            return FAILED
+        except OSError as error:  # such as a full disk behind a redirected output
+            _discard_output()
+            print(f"sb3-flock: {error.filename or 'output'}: {error.strerror or error}", file=sys.stderr)
             return FAILED
         except KeyboardInterrupt:
             print("sb3-flock: interrupted", file=sys.stderr)
@@ -56,13 +63,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         except UserError as error:
             print(f"sb3-flock: {error}", file=sys.stderr)
             return USAGE_ERROR
-        except MemoryError as error:
+        except (MemoryError, RunError) as error:
+            is_memory = isinstance(error, MemoryError)
             what = " ".join(str(error).split()) or "something is too large"
-            print(f"sb3-flock: not enough memory: {what}", file=sys.stderr)
+            print(f"sb3-flock: {'not enough memory: ' if is_memory else ''}{what}", file=sys.stderr)
             return FAILED
-        except RunError as error:
-            print(f"sb3-flock: {error}", file=sys.stderr)
-            return FAILED
+
+
+def _discard_output() -> None:
+    """Nobody reads what is still to be printed."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _parse(words: Sequence[str]) -> argparse.Namespace:

@@ -24,8 +24,7 @@ def add(parser: Parser) -> None:
 
 def run(options: argparse.Namespace, words: Sequence[str]) -> int:
     """Print the tables, and plot where asked for."""
-    from rich.console import Console
-
+    from sb3_flock.console import PlainConsole
     from sb3_flock.viz.compare import differences_table, load_runs, plot_curves, results_table
     from sb3_flock.viz.figures import check_figure_file, save_as
 
@@ -33,7 +32,7 @@ def run(options: argparse.Namespace, words: Sequence[str]) -> int:
         with written_to("--output", options.output):
             check_figure_file(Path(options.output))
     runs = load_runs(options.runs)
-    console = Console()
+    console = PlainConsole()
     console.print(results_table(runs))
     differences = differences_table(runs)
     if differences is not None:

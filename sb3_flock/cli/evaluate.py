@@ -27,18 +27,18 @@ def add(parser: Parser) -> None:
 
 def run(options: argparse.Namespace, words: Sequence[str]) -> int:
     """Evaluate, print, and write JSON where asked for."""
-    from rich.console import Console
+    from sb3_flock.console import PlainConsole
 
     if options.output is not None and not Path(options.output).absolute().parent.is_dir():
         raise SettingsError(f"--output {options.output}: there is no folder {Path(options.output).parent}")
     controller, name, scenario = shared.rollout_of(options)
-    console = Console(stderr=True)
+    console = PlainConsole(stderr=True)
     metrics = shared.evaluate_and_print(controller, name, scenario, options.episodes, options.seed, console)
     if options.sensors:
         from sb3_flock.evaluation.robustness import errors_table, evaluate_with_errors
 
         with console.status("simulating sensor errors"):
-            Console().print(errors_table(evaluate_with_errors(controller, scenario, options.episodes, options.seed)))
+            PlainConsole().print(errors_table(evaluate_with_errors(controller, scenario, options.episodes, options.seed)))
     if options.output is not None:
         from sb3_flock.evaluation.report import write_json
         from sb3_flock.serialization.save import versions

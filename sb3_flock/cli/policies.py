@@ -28,9 +28,9 @@ def add(parser: Parser) -> None:
 
 def run(options: argparse.Namespace, words: Sequence[str]) -> int:
     """Print the list or the card."""
-    from rich.console import Console
+    from sb3_flock.console import PlainConsole
 
-    console = Console(highlight=False)
+    console = PlainConsole()
     if options.name is None:
         console.print(_list())
         console.print(

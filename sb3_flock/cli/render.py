@@ -26,15 +26,14 @@ def add(parser: Parser) -> None:
 
 def run(options: argparse.Namespace, words: Sequence[str]) -> int:
     """Render, and print the file's path."""
-    from rich.console import Console
-
+    from sb3_flock.console import PlainConsole
     from sb3_flock.viz.video import check_video, render
 
     with written_to("--output", options.output):
         check_video(Path(options.output), options.speed)
     controller, name, scenario = shared.rollout_of(options)
     title = f"{options.policy or name}: {scenario.bodies}, episode {options.episode} of seed {options.seed}"
-    with Console(stderr=True).status("simulating"), written_to("--output", options.output):
+    with PlainConsole(stderr=True).status("simulating"), written_to("--output", options.output):
         path = render(controller, scenario, options.output, options.seed, options.episode, options.speed, title)
     print(path)
     return 0

@@ -99,8 +99,7 @@ def load_trusted_or_not(path: str | Path, device: str = "cpu", trust: bool = Fal
 
 def evaluate_and_print(controller: Any, name: str, scenario: Any, episodes: int, seed: int, console: Console) -> Any:
     """Evaluate, print the table, and return the metrics."""
-    from rich.console import Console as RichConsole
-
+    from sb3_flock.console import PlainConsole
     from sb3_flock.evaluation import evaluate
     from sb3_flock.evaluation.report import metrics_table
 
@@ -108,5 +107,5 @@ def evaluate_and_print(controller: Any, name: str, scenario: Any, episodes: int,
         metrics = evaluate(controller, scenario, episodes, seed)
     print(f"{name}:")
     print(f"{scenario.bodies}, {episodes} episodes, seed {seed}")
-    RichConsole().print(metrics_table(metrics, scenario))
+    PlainConsole().print(metrics_table(metrics, scenario))
     return metrics

@@ -70,11 +70,10 @@ def run(options: argparse.Namespace, words: Sequence[str]) -> int:
 
 
 def _report(config: Any, trials: Sequence[Any], output: str) -> int:
-    from rich.console import Console
-
+    from sb3_flock.console import PlainConsole
     from sb3_flock.sweep.statistics import report
 
-    console = Console()
+    console = PlainConsole()
     for table in report(config, trials, output):
         console.print(table)
     for trial in trials:

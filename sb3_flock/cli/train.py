@@ -108,9 +108,9 @@ def _overrides_of(options: argparse.Namespace) -> dict[str, Any]:
 @contextlib.contextmanager
 def _resume_as_command() -> Iterator[Any]:
     """A console for the training; where the library says that a folder can be resumed, it and errors show the command."""
-    from rich.console import Console
+    from sb3_flock.console import PlainConsole
 
-    class CommandConsole(Console):
+    class CommandConsole(PlainConsole):
         def print(self, *objects: Any, **kwargs: Any) -> None:
             super().print(*(_as_command(line) if isinstance(line, str) else line for line in objects), **kwargs)
 

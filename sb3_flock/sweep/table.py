@@ -7,11 +7,12 @@ from collections import Counter
 from typing import Any
 
 from ray import tune
-from rich.console import Console, Group
+from rich.console import Group
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from sb3_flock.console import PlainConsole
 from sb3_flock.evaluation.metrics import columns
 from sb3_flock.evaluation.report import add_short_columns, plain_table, short_cells
 
@@ -23,7 +24,7 @@ class TrialsTable(tune.Callback):
     """
 
     def __init__(self) -> None:
-        self.console = Console(stderr=True)
+        self.console = PlainConsole(stderr=True)
         self._live: Live | None = None
         self._drawn = 0.0
         self._ended: list[Any] = []

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import torch as th
 from ray import tune
-from rich.console import Console
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_flock.config.training import TrainingConfig
+from sb3_flock.console import PlainConsole
 from sb3_flock.evaluation import evaluate
 from sb3_flock.evaluation.metrics import Metric, columns, score
 from sb3_flock.rl.callbacks import DivergedError
@@ -60,7 +60,7 @@ def train_trial(point: dict[str, Any], sweep: Mapping[str, Any]) -> None:
 
 def _train_or_resume(config: TrainingConfig, reports: Reports) -> Path:
     """Train to the end; returns the run folder, in the trial's own working directory."""
-    console = Console(stderr=True, force_terminal=False, width=200)
+    console = PlainConsole(stderr=True, force_terminal=False, width=200)
     saved = tune.get_checkpoint()
     if saved is None:
         return train(config, console, ["sb3-flock", "sweep"], callbacks=[reports]).folder

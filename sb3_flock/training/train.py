@@ -16,6 +16,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
 from sb3_flock.config.training import TrainingConfig
+from sb3_flock.console import PlainConsole
 from sb3_flock.controllers import EXPERTS
 from sb3_flock.envs.expert_env import ExpertEnv
 from sb3_flock.envs.flocking_v0 import parallel_env
@@ -87,7 +88,7 @@ def train(
     :raises WorldError: if the arena is too crowded to start
     :raises RunError: if the disk is full, a worker dies or a loss is not finite; saved files stay
     """
-    console = console or Console(stderr=True)
+    console = console or PlainConsole(stderr=True)
     with GracefulShutdown().waiting() as signals:
         model, env = _prepare(config)
         try:
@@ -118,7 +119,7 @@ def resume(
     :raises SettingsError: for a folder that is not a run's or is in use, a field that cannot change, a run that is complete
     :raises RunError: as in :func:`train`
     """
-    folder, console = Path(folder), console or Console(stderr=True)
+    folder, console = Path(folder), console or PlainConsole(stderr=True)
     if not (folder / "config.yaml").is_file():
         raise SettingsError(f"resume {folder}: not a run folder (there is no config.yaml)")
     config = load_config(TrainingConfig, folder / "config.yaml")
