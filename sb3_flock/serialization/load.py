@@ -31,9 +31,10 @@ from sb3_flock.envs.flocking_v0 import action_space, observation_space
 from sb3_flock.pretrained import shipped_policies
 from sb3_flock.rl.ddpg import FlockDDPG
 from sb3_flock.rl.registry import ALGORITHMS, build_model, fewest_parameters, policy_kwargs
+from sb3_flock.serialization.archive import check_size, read_member
 from sb3_flock.serialization.migrate import FORMAT, MEMBER, check_format, migrate_config, migrate_weights
 from sb3_flock.serialization.yaml_io import load_config
-from sb3_flock.settings import SettingsError, UserError
+from sb3_flock.settings import SettingsError, UserError, format_value
 from sb3_flock.sim import Scenario, check_actions
 
 _CHECKPOINT = re.compile(r"rl_model_(\d+)_steps\.zip")
@@ -225,7 +226,9 @@ def load_policy(path: str | Path, device: str = "cpu", trust: bool = False) -> L
         values, _ = migrate_config(TrainingConfig, member["config"], number)
         config, weights = TrainingConfig(**values), migrate_weights(weights, number)
         policy = _trusted_policy(path, torch_device) if trust else _rebuild(config, weights, not has_member)
-        num_timesteps = int(member.get("num_timesteps", 0))
+        num_timesteps = member.get("num_timesteps", 0)
+        if type(num_timesteps) is not int or num_timesteps < 0:
+            raise PolicyError(f"{path}: num_timesteps = {format_value(num_timesteps)}: a number of transitions is needed")
         trained_with = {str(name): str(number) for name, number in dict(member.get("versions", {})).items()}
     except PolicyError:
         raise
@@ -244,24 +247,6 @@ _MAX_TENSORS = 2**28
 """Largest number of bytes of a member: 700 times our default networks."""
 
 
-def read_member(archive: zipfile.ZipFile, name: str, limit: int) -> bytes:
-    """A member of at most so many bytes; the unpacked size is bounded, whatever the header says.
-
-    :raises KeyError: if there is none
-    :raises ValueError: if it is larger, or packed in an unusual way
-    """
-    info = archive.getinfo(name)
-    if info.file_size > limit:
-        raise ValueError(f"{name} has {info.file_size} bytes: at most {limit} are read")
-    if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        raise ValueError(f"{name} is packed by another method than deflation")
-    with archive.open(info) as file:
-        content = file.read(max(1, info.file_size))  # a bare read() would unpack as much as there is
-        if len(content) < info.file_size or file.read(1):
-            raise ValueError(f"{name} has another size than its header says")
-    return content
-
-
 def read_tensors(archive: zipfile.ZipFile, name: str, device: th.device, limit: int = _MAX_TENSORS) -> dict[str, Any]:
     """The tensors of a ``.pth`` member, by torch's reader that knows tensors and plain values only.
 
@@ -269,9 +254,7 @@ def read_tensors(archive: zipfile.ZipFile, name: str, device: th.device, limit: 
     """
     stored = io.BytesIO(read_member(archive, name, limit))
     with zipfile.ZipFile(stored) as inner:
-        size = sum(info.file_size for info in inner.infolist())
-    if size > limit:
-        raise ValueError(f"{name} holds {size} bytes: at most {limit} are read")
+        check_size(inner, stored.getbuffer().nbytes)  # torch packs nothing
     stored.seek(0)
     tensors: dict[str, Any] = th.load(stored, map_location=device, weights_only=True)
     return tensors

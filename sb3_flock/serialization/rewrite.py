@@ -19,7 +19,8 @@ from sb3_flock._renamed import POLICIES, rename_key
 from sb3_flock.config.training import TrainingConfig
 from sb3_flock.envs.vec_env import make_vec_env
 from sb3_flock.rl.registry import build_model
-from sb3_flock.serialization.load import PolicyError, first_line, load_policy, read_member
+from sb3_flock.serialization.archive import read_member, read_text
+from sb3_flock.serialization.load import PolicyError, first_line, load_policy
 from sb3_flock.serialization.migrate import FORMAT, MEMBER, check_format, format_of, migrate_config
 from sb3_flock.serialization.save import atomic_write
 from sb3_flock.serialization.yaml_io import check_groups, read_yaml, to_yaml
@@ -30,6 +31,7 @@ _CHECKPOINT = "training.json"
 
 _MAX_MEMBER = 2**28
 _MAX_JSON = 2**20
+_MAX_CARD = 2**22
 
 
 def rewrite(path: str | Path) -> bool:
@@ -127,7 +129,7 @@ def _with_numbers_of(data: Mapping[str, Any], fresh: dict[str, Any]) -> bytes:
 def _card(path: Path) -> bytes | None:
     """The same for a model card: its config."""
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path, _MAX_CARD)
         card = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise SettingsError(f"{path}: not a JSON file ({first_line(error)})") from None
@@ -149,8 +151,8 @@ def _card(path: Path) -> bytes | None:
 
 def _config(path: Path) -> bytes | None:
     """The same for a training's or a sweep's config."""
-    text = path.read_text(encoding="utf-8", errors="replace")
-    values = read_yaml(path, text)
+    values = read_yaml(path)
+    text = read_text(path)
     if "grid" in values or "search" in values:
         current = _sweep(values)
         return None if current == values else _dump(current, text)

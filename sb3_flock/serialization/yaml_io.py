@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 import yaml
 
 from sb3_flock._renamed import RenamedWarning
+from sb3_flock.serialization.archive import read_text
 from sb3_flock.serialization.migrate import FORMAT, format_of, migrate_config
 from sb3_flock.settings import Settings, SettingsError, format_value, group_of, leaf_paths, resolve_path, suggest
 
@@ -147,7 +148,7 @@ def read_yaml(path: Path, text: str | None = None) -> dict[str, Any]:
     :raises SettingsError: one line for a file that cannot be read or holds no mapping
     """
     try:
-        values = yaml.load(path.read_text(encoding="utf-8") if text is None else text, _Loader)
+        values = yaml.load(read_text(path) if text is None else text, _Loader)
     except OSError as error:
         raise SettingsError(f"config {path}: {error.strerror or error}") from None
     except SettingsError as error:

@@ -19,6 +19,7 @@ from sb3_flock.console import PlainConsole
 from sb3_flock.evaluation import evaluate
 from sb3_flock.evaluation.metrics import Metric, columns, score
 from sb3_flock.rl.callbacks import DivergedError
+from sb3_flock.serialization.archive import read_curves
 from sb3_flock.serialization.load import LoadedPolicy, checkpoint_paths, load_policy
 from sb3_flock.settings import UserError
 from sb3_flock.sweep.config import SweepConfig
@@ -107,10 +108,10 @@ class Reports(BaseCallback):
         saved, history = checkpoint_paths(folder)[-1:], folder / "evaluations.npz"
         evaluated = history.stat().st_mtime_ns if history.exists() else 0
         if evaluated != seen[1]:
-            with np.load(history, allow_pickle=False) as curves:
-                # A run that an earlier version began may lack a metric until its next evaluation.
-                self.row.update({name: float(curves[name][-1]) for name in columns() if name in curves})
-                self.row.update(score=float(curves["score"].min()), minutes=float(curves["seconds"][-1]) / 60)
+            curves = read_curves(history)
+            # A run that an earlier version began may lack a metric until its next evaluation.
+            self.row.update({name: float(curves[name][-1]) for name in columns() if name in curves})
+            self.row.update(score=float(curves["score"].min()), minutes=float(curves["seconds"][-1]) / 60)
         return saved[0] if saved else None, evaluated
 
 

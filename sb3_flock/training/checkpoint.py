@@ -36,7 +36,8 @@ from sb3_flock.rl.buffers import load_replay_state, replay_state
 from sb3_flock.rl.compiled_update import compiled_kernels
 from sb3_flock.rl.ddpg import FlockTD3
 from sb3_flock.rl.registry import ALGORITHMS, uses_compact_buffer
-from sb3_flock.serialization.load import PolicyError, checkpoint_paths, first_line, read_member, read_tensors
+from sb3_flock.serialization.archive import check_size, read_member
+from sb3_flock.serialization.load import PolicyError, checkpoint_paths, first_line, read_tensors
 from sb3_flock.serialization.migrate import MEMBER, check_format, migrate_state
 from sb3_flock.serialization.save import save_model, versions
 from sb3_flock.sim.backend import compiled
@@ -84,7 +85,7 @@ class LoadedCheckpoint:
     """A checkpoint in memory, whole and well-formed.
 
     :param path: the zip
-    :param limit: largest number of bytes that a part of it may unpack to
+    :param limit: largest number of bytes that it may unpack to
     :raises PolicyError: one line for a missing, damaged or unknown file
     """
 
@@ -92,6 +93,7 @@ class LoadedCheckpoint:
         self.path = path
         try:
             with zipfile.ZipFile(path) as archive:
+                check_size(archive, limit)
                 values = json.loads(read_member(archive, _VALUES, limit))
                 arrays = {}
                 for name in archive.namelist():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
@@ -18,6 +17,7 @@ from rich.table import Table
 from sb3_flock.config.training import TrainingConfig
 from sb3_flock.evaluation.metrics import METRICS, columns
 from sb3_flock.evaluation.report import add_short_columns, plain_table, short_cells
+from sb3_flock.serialization.archive import read_curves
 from sb3_flock.serialization.yaml_io import load_config
 from sb3_flock.settings import SettingsError, leaf_paths
 from sb3_flock.viz.figures import LINE_STYLES, new_figure
@@ -55,13 +55,13 @@ def _load(folder: Path, name: str) -> Run:
         raise SettingsError(f"{folder}: not a run folder (there is no config.yaml)")
     config = load_config(TrainingConfig, folder / "config.yaml")
     try:
-        with np.load(folder / "evaluations.npz", allow_pickle=False) as file:
-            curves = {key: file[key] for key in ("timesteps", "seconds", "score")}
-            missing = np.full(len(curves["score"]), np.nan)  # of metrics that were registered later
-            curves.update({name: file.get(name, missing) for name in columns()})
+        stored = read_curves(folder / "evaluations.npz")
+        curves = {key: stored[key] for key in ("timesteps", "seconds", "score")}
+        missing = np.full(len(curves["score"]), np.nan)  # of metrics that were registered later
+        curves.update({name: stored.get(name, missing) for name in columns()})
     except FileNotFoundError:
         raise SettingsError(f"{folder}: there is no evaluation yet (evaluations.npz)") from None
-    except (OSError, ValueError, KeyError, EOFError, MemoryError, zipfile.BadZipFile) as error:
+    except (ValueError, KeyError, TypeError) as error:
         raise SettingsError(f"{folder}: evaluations.npz is damaged ({' '.join(str(error).split())[:100]})") from None
     if len({curve.shape for curve in curves.values()}) != 1 or curves["score"].ndim != 1 or not len(curves["score"]):
         raise SettingsError(f"{folder}: evaluations.npz is damaged (its curves differ in length)")

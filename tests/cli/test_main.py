@@ -130,7 +130,9 @@ def test_exit_codes(error, code, line, capsys, monkeypatch):
 @pytest.mark.parametrize("words", [["--version"], ["config"], ["policies"], ["policies", "flock"]])
 def test_output_that_cannot_be_written_is_one_line(words):
     with open("/dev/full", "w") as full:
-        done = subprocess.run([sys.executable, "-m", "sb3_flock.cli", *words], stdout=full, stderr=subprocess.PIPE, check=False)
+        done = subprocess.run(
+            [sys.executable, "-m", "sb3_flock.cli", *words], stdout=full, stderr=subprocess.PIPE, check=False
+        )
     assert (done.returncode, done.stderr) == (1, b"sb3-flock: output: No space left on device\n")
 
 
@@ -146,7 +148,18 @@ def test_output_that_nobody_reads_is_no_traceback(words):
 @pytest.mark.parametrize("name", ["x[/y]", "runs[v2]", ":smile:"])
 def test_a_folder_is_named_as_it_is(name, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    words = ["--total-timesteps", "60", "-f", name, "--eval-freq", "0", "--set", "n_test_episodes=1", "--set", "buffer_size=100"]
+    words = [
+        "--total-timesteps",
+        "60",
+        "-f",
+        name,
+        "--eval-freq",
+        "0",
+        "--set",
+        "n_test_episodes=1",
+        "--set",
+        "buffer_size=100",
+    ]
     assert main(["train", *words]) == 0
     captured = capsys.readouterr()
     assert captured.out.endswith(f"{name}/ddpg_3v1o_1\n")

@@ -90,6 +90,16 @@ def test_weights_that_are_not_finite_are_refused(model, saved):
         load_policy(rewrite(saved, {"policy.pth": saved.with_name("policy.pth").read_bytes()}))
 
 
+@pytest.mark.parametrize("number", ["Infinity", "NaN", "-1", "1.5", '"many"', "true"])
+def test_a_number_of_transitions_that_is_none_is_refused_in_one_line(number, saved):
+    with zipfile.ZipFile(saved) as archive:
+        member = json.loads(archive.read("flock.json"))
+    member["num_timesteps"] = "HERE"
+    changed = json.dumps(member).replace('"HERE"', number).encode()
+    with pytest.raises(PolicyError, match=r"num_timesteps = .*: a number of transitions is needed"):
+        load_policy(rewrite(saved, {"flock.json": changed}))
+
+
 class Hostile:
     """Unpickled, it makes a file."""
 

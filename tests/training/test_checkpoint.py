@@ -1,5 +1,6 @@
 import csv
 import functools
+import zipfile
 
 import numpy as np
 import pytest
@@ -105,3 +106,16 @@ def test_a_checkpoint_of_another_config_is_refused(tmp_path):
     (first.folder / "config.yaml").write_text(to_yaml(wider))
     with pytest.raises(PolicyError, match="not a checkpoint of this run's config"):
         resume(first.folder, quiet())
+
+
+def test_what_all_parts_of_a_checkpoint_unpack_to_is_bounded(tmp_path):
+    """Twenty arrays, each below the limit, that are packed to a thousandth."""
+    path, limit = tmp_path / "rl_model_1_steps.zip", 10**6
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("training.json", "{}")
+        for i in range(20):
+            archive.writestr(f"training/part{i}.npy", bytes(limit // 10))
+    with pytest.raises(
+        PolicyError, match=rf"damaged or not a checkpoint \(it unpacks to \d+ bytes: at most {limit} are read\)"
+    ):
+        LoadedCheckpoint(path, limit)

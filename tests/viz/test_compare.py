@@ -28,7 +28,8 @@ def run_folder(folder, scores=(0.5, 0.2, 0.3), **changes):
 
 @pytest.fixture
 def runs(tmp_path):
-    return [run_folder(tmp_path / "runs" / "a" / "one"), run_folder(tmp_path / "runs" / "b", (0.1, 0.4), **{"lambda_": 0.5})]
+    first = run_folder(tmp_path / "runs" / "a" / "one", total_timesteps=300_000, lambda_=0.7)
+    return [first, run_folder(tmp_path / "runs" / "b", (0.1, 0.4), total_timesteps=300_000, lambda_=0.5)]
 
 
 def text(table, width=80):
