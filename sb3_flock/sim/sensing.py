@@ -84,7 +84,7 @@ class Contacts:
         return [self.bodies[start:end] for start, end in zip([0, *ends], ends, strict=False)]
 
     def compensate_ego_motion(self, ego_motion: NDArray[np.float64]) -> Contacts:
-        """The same bodies, where they were, in the observers' frames after a further ego-motion ``(contacts, 2)``."""
+        """The same bodies, where they were, in the observers' frames after a further ego-motion ``(contacts, 2 or 3)``."""
         positions = compensate_ego_motion(self.positions, ego_motion)
         return replace(self, positions=positions, distances=_norm(positions))
 
@@ -112,14 +112,15 @@ class Sensing:
     waypoint_distances: NDArray[np.float64]
     """``(flocks, vehicles)``."""
     ego_motion: NDArray[np.float64]
-    """``(flocks, vehicles, 2)``: the vehicle's own motion since the last step, forward [m], then turn [rad]; 0 at the start."""
+    """The vehicle's own motion since the last step, forward [m], then turn [rad], ``(flocks, vehicles, 2)``; 0 at the start.
+    Where vehicles also move to the side, ``(flocks, vehicles, 3)``: the third is to the left [m], before the turn."""
     previous: Sensing | None = None
     """What was sensed ``motion_lag`` ago, in the vehicles' present frames; ``None`` without motion channels."""
 
     def compensate_ego_motion(self, ego_motion: NDArray[np.float64]) -> Sensing:
-        """The same bodies, where they were, in the vehicles' frames after a further ego-motion ``(flocks, vehicles, 2)``."""
+        """The same bodies, where they were, in the vehicles' frames after a further :attr:`ego_motion`."""
         neighbors, obstacles = (
-            contacts.compensate_ego_motion(ego_motion.reshape(-1, 2)[contacts.observers])
+            contacts.compensate_ego_motion(ego_motion.reshape(-1, ego_motion.shape[-1])[contacts.observers])
             for contacts in (self.neighbors, self.obstacles)
         )
         waypoints = compensate_ego_motion(self.waypoint_positions, ego_motion)
@@ -161,7 +162,7 @@ def sense(
         sensing = Sensing(
             neighbors=find_contacts(positions, frames, positions, link_range, exclude_self=True),
             obstacles=find_contacts(positions, frames, obstacle_positions, detection_range),
-            waypoint_positions=_to_body(offsets, frames),
+            waypoint_positions=to_body(offsets, frames),
             waypoint_distances=_norm(offsets),
             ego_motion=ego_motion,
         )
@@ -196,19 +197,21 @@ def share_detections(
     )
     flocks = observers // positions.shape[1]
     offsets = obstacle_positions[flocks, bodies] - positions.reshape(-1, 2)[observers]
-    return Contacts(detected.shape, observers, bodies, _to_body(offsets, frames.reshape(-1, 2)[observers]), _norm(offsets))
+    return Contacts(detected.shape, observers, bodies, to_body(offsets, frames.reshape(-1, 2)[observers]), _norm(offsets))
 
 
 def compensate_ego_motion(positions: NDArray[np.float64], ego_motion: NDArray[np.float64]) -> NDArray[np.float64]:
     """Positions in a body's frame, transformed into its frame after the body has moved.
 
     :param positions: ``(..., 2)`` [m], in the frame before the motion
-    :param ego_motion: ``(..., 2)``: forward [m], then turn [rad], as :attr:`Sensing.ego_motion`
+    :param ego_motion: ``(..., 2)``: forward [m], then turn [rad], or ``(..., 3)`` with a third, to the left [m], as
+        :attr:`Sensing.ego_motion`
     :return: ``(..., 2)`` [m], in the frame after it
     """
     forward, turn = ego_motion[..., 0], ego_motion[..., 1]
-    ahead = np.stack((positions[..., 0] - forward, positions[..., 1]), axis=-1)
-    return _to_body(ahead, np.stack((np.cos(turn), np.sin(turn)), axis=-1))
+    across = positions[..., 1] - ego_motion[..., 2] if ego_motion.shape[-1] > 2 else positions[..., 1]
+    ahead = np.stack((positions[..., 0] - forward, across), axis=-1)
+    return to_body(ahead, np.stack((np.cos(turn), np.sin(turn)), axis=-1))
 
 
 def find_contacts(
@@ -239,7 +242,7 @@ def find_contacts(
     if exclude_self:
         apart = observers % shape[1] != found
         observers, found, offsets, distances = observers[apart], found[apart], offsets[apart], distances[apart]
-    return Contacts(shape, observers, found, _to_body(offsets, frames.reshape(-1, 2)[observers]), distances)
+    return Contacts(shape, observers, found, to_body(offsets, frames.reshape(-1, 2)[observers]), distances)
 
 
 Pairs = tuple["NDArray[np.int64]", "NDArray[np.int64]", "NDArray[np.float64]", "NDArray[np.float64]"]
@@ -331,7 +334,7 @@ def _norm(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.sqrt(np.square(vectors[..., 0]) + np.square(vectors[..., 1]))
 
 
-def _to_body(offsets: NDArray[np.float64], frames: NDArray[np.float64]) -> NDArray[np.float64]:
+def to_body(offsets: NDArray[np.float64], frames: NDArray[np.float64]) -> NDArray[np.float64]:
     """Rotate world offsets into the body frame: x_ij = R(theta_i) (x_j - x_i), R the rotation into the frame."""
     (x, y), (cos, sin) = np.moveaxis(offsets, -1, 0), np.moveaxis(frames, -1, 0)
     return np.stack((cos * x + sin * y, cos * y - sin * x), axis=-1)

@@ -13,10 +13,11 @@ from pydantic import Field, model_validator
 from sb3_flock.settings import ActionError, Coordinate, NotNegative, Positive, UserError
 from sb3_flock.sim import dynamics
 from sb3_flock.sim.backend import compiled
-from sb3_flock.sim.dynamics import directions_of
+from sb3_flock.sim.dynamics import DYNAMICS, VehicleDynamics, directions_of, wrap_angle
 from sb3_flock.sim.safety import SafetySettings, filter_actions
-from sb3_flock.sim.sensing import Sensing, sense
+from sb3_flock.sim.sensing import Sensing, sense, to_body
 from sb3_flock.sim.sensors import Sensors
+from sb3_flock.sim.unicycle import Unicycle  # noqa: F401 - registers the default dynamics
 
 if TYPE_CHECKING:
     from numpy.random import Generator
@@ -135,6 +136,7 @@ class World:
         self.scenario, self._safety = scenario, safety
         self.n_flocks = n_flocks
         self.sensors = Sensors(scenario)
+        self.dynamics: VehicleDynamics = DYNAMICS[scenario.dynamics](scenario)
         self.steps = scenario.max_cycles  # no episode is running before the first reset
         self.action_low = np.array([0.0, -scenario.max_turn_rate])
         self.action_high = np.array([scenario.max_speed, scenario.max_turn_rate])
@@ -195,11 +197,14 @@ class World:
         self.obstacle_speeds = np.stack([speeds for speeds, _ in walks], axis=1)
         self.obstacle_turn_rates = np.stack([turns for _, turns in walks], axis=1) * scenario.obstacle_turn_std
         self.sensors.reset(rngs)
+        self.dynamics.reset(rngs)
         self.steps = 0
         return self.sense()
 
     def step(self, actions: ArrayLike) -> tuple[Sensing, NDArray[np.float64]]:
         """Move every body by one sampling period, vehicles, obstacles and waypoint together (section III-A).
+
+        The actions are commands: how the vehicles follow them is a matter of their dynamics.
 
         :param actions: ``(flocks, vehicles, 2)``, speed v [m/s] and turn rate omega [rad/s], clipped to their bounds
         :return: what the vehicles sense afterwards, and the executed actions: clipped, and filtered where the scenario says so
@@ -216,9 +221,9 @@ class World:
         if safety.is_filtered:
             executed = filter_actions(executed, self.sensors.latest or self.sense(), safety, self.frames)
         self.sensors.latest = None
-        self._move(executed)
+        ego_motion = self._move(executed)
         self.steps += 1
-        return self.sense(executed * self.scenario.time_step), executed
+        return self.sense(ego_motion), executed
 
     def state_dict(self) -> dict[str, Any]:
         """The current episode: everything its next steps depend on besides the actions."""
@@ -226,6 +231,7 @@ class World:
             **{name: getattr(self, name) for name in _EPISODE},
             "steps": self.steps,
             "sensors": self.sensors.state_dict(),
+            "dynamics": self.dynamics.state_dict(),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -250,25 +256,50 @@ class World:
             setattr(self, name, np.array(state[name], dtype=np.float64))
         self.steps = int(state["steps"])
         self.sensors.load_state_dict(state["sensors"])
+        if "dynamics" in state:
+            self.dynamics.load_state_dict(state["dynamics"])
+        else:  # of an earlier version, whose vehicles had no state of their own
+            self.dynamics.reset([np.random.default_rng(0) for _ in range(flocks)])
 
-    def _move(self, controls: NDArray[np.float64]) -> None:
-        """Vehicles by their controls ``(flocks, vehicles, 2)`` [m/s, rad/s], obstacles by drawn ones, and the waypoint."""
-        self.positions, self.headings, self.obstacle_positions, self.obstacle_headings = (
-            compiled() or dynamics
-        ).move_bodies(
-            self.positions,
-            self.frames,
-            self.headings,
-            controls,
+    def _move(self, controls: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Vehicles by their controls ``(flocks, vehicles, 2)`` [m/s, rad/s], obstacles by drawn ones, and the waypoint.
+
+        :return: the vehicles' own motion, :attr:`Sensing.ego_motion`
+        """
+        is_plain, dt = self.dynamics.is_plain, self.scenario.time_step
+        ego_motion = controls * dt if is_plain else self._move_vehicles(controls)
+        vehicles = slice(None) if is_plain else slice(0)
+        positions, headings, self.obstacle_positions, self.obstacle_headings = (compiled() or dynamics).move_bodies(
+            self.positions[:, vehicles],
+            self.frames[:, vehicles],
+            self.headings[:, vehicles],
+            controls[:, vehicles],
             self.obstacle_positions,
             directions_of(self.obstacle_headings),
             self.obstacle_headings,
             self.obstacle_speeds[self.steps],
             self.obstacle_turn_rates[self.steps],
-            self.scenario.time_step,
+            dt,
             self.scenario.obstacle_half_side,
         )
+        if is_plain:
+            self.positions, self.headings = positions, headings
         self.waypoints = waypoints_ahead(self.scenario, self.waypoints, self.steps, self._one_step)[:, 0]
+        return ego_motion
+
+    def _move_vehicles(self, controls: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Vehicles by their dynamics; their own motion forward, turn and to the left, ``(flocks, vehicles, 3)``."""
+        before, frames, earlier = self.positions, self.frames, self.headings
+        positions, headings = self.dynamics.step(before, earlier, controls, self.scenario.time_step)
+        for name, now, then in (("positions", positions, before), ("headings", headings, earlier)):
+            if np.shape(now) != then.shape or not np.isfinite(now).all():
+                raise ValueError(
+                    f"dynamics = {self.scenario.dynamics}: its step returns {name} of shape {np.shape(now)}: finite ones of "
+                    f"shape {then.shape} are needed"
+                )
+        self.positions, self.headings = positions, wrap_angle(headings)
+        forward, left = np.moveaxis(to_body(positions - before, frames), -1, 0)
+        return np.stack((forward, wrap_angle(headings - earlier), left), axis=-1)
 
     def _start(self, rng: Generator) -> tuple[NDArray[np.float64], ...]:
         scenario = self.scenario

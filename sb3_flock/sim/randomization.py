@@ -1,0 +1,63 @@
+"""Domain randomization: fields of the sensors and the actuators that have another value in each flock and episode."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.random import Generator
+    from numpy.typing import NDArray
+
+    from sb3_flock.settings import Settings
+
+UNBOUNDED = 1e300
+"""Stands for a bound that is ``None``: no product of it with a length or a time of the package overflows."""
+
+
+class FlockValues:
+    """The numbers of a group of settings, each as an array that broadcasts with one number a flock and vehicle.
+
+    :param settings: the group; ``None`` is :data:`UNBOUNDED`
+    :param drawn: values of some fields by name, one a flock, ``(flocks,)``
+
+    :ivar are_drawn: whether any value differs between flocks
+    """
+
+    def __init__(self, settings: Settings, drawn: Mapping[str, NDArray[np.float64]] | None = None) -> None:
+        fixed = {name: getattr(settings, name) for name in type(settings).model_fields}
+        self._values = {
+            name: np.full((1, 1), UNBOUNDED if value is None else value, dtype=np.float64) for name, value in fixed.items()
+        }
+        self._values.update({name: np.asarray(values, np.float64)[:, None] for name, values in (drawn or {}).items()})
+        self.are_drawn = bool(drawn)
+
+    def __getattr__(self, name: str) -> NDArray[np.float64]:
+        """The values of a field, ``(flocks, 1)`` or ``(1, 1)``."""
+        if name.startswith("_") or name not in self._values:
+            raise AttributeError(name)
+        return self._values[name]
+
+    def of_flocks(self, name: str, n_flocks: int) -> NDArray[np.float64]:
+        """The values of a field, one a flock, ``(flocks,)``."""
+        return np.ascontiguousarray(np.broadcast_to(self._values[name][:, 0], (n_flocks,)))
+
+
+def own_rngs(rngs: Sequence[Generator]) -> list[Generator]:
+    """A generator for a part of each flock, seeded by a draw from the flock's own: the part's draws change no other's."""
+    return [np.random.default_rng(rng.integers(2**63, size=2)) for rng in rngs]
+
+
+def rng_states(rngs: Sequence[Generator]) -> list[Any]:
+    """The states of generators, as plain values."""
+    return [rng.bit_generator.state for rng in rngs]
+
+
+def rngs_of(states: Sequence[Any]) -> list[Generator]:
+    """The generators of :func:`rng_states`."""
+    rngs = [np.random.default_rng() for _ in states]
+    for rng, state in zip(rngs, states, strict=True):
+        rng.bit_generator.state = state
+    return rngs
