@@ -6,9 +6,9 @@ from typing import Any
 
 from rich.table import Table
 
-from sb3_flock.evaluation.metrics import Metric
+from sb3_flock.evaluation.metrics import Metric, summarize
 from sb3_flock.evaluation.report import add_short_columns, plain_table, short_cells
-from sb3_flock.evaluation.rollout import evaluate
+from sb3_flock.evaluation.rollout import as_controller, rollout
 from sb3_flock.sim import Scenario
 from sb3_flock.sim.sensors import SensorErrors
 
@@ -27,8 +27,8 @@ def sensor_errors(scenario: Scenario) -> dict[str, SensorErrors]:
 
 def evaluate_with_errors(policy: Any, scenario: Scenario, episodes: int, seed: int = 0) -> dict[str, dict[str, Metric]]:
     """The metrics under each of :func:`sensor_errors`; the parameters are those of :func:`~sb3_flock.evaluation.evaluate`."""
-    rows = sensor_errors(scenario).items()
-    return {name: evaluate(policy, scenario.replace(sensors=errors), episodes, seed) for name, errors in rows}
+    rows = ((name, scenario.replace(sensors=errors)) for name, errors in sensor_errors(scenario).items())
+    return {name: summarize(rollout(as_controller(policy, row), row, episodes, seed)) for name, row in rows}
 
 
 def cells(row: dict[str, Metric]) -> list[str]:

@@ -219,7 +219,8 @@ class World:
         check_actions(given, low.shape, "flock", "vehicle")
         executed = np.minimum(np.maximum(given, low), high)
         if safety.is_filtered:
-            executed = filter_actions(executed, self.sensors.latest or self.sense(), safety, self.frames)
+            measured, stopping = self.sensors.latest or self.sense(), self.dynamics.stopping()
+            executed = filter_actions(executed, measured, safety, self.frames, stopping=stopping)
         self.sensors.latest = None
         ego_motion = self._move(executed)
         self.steps += 1
