@@ -226,6 +226,31 @@ def find_contacts_by_cell(
     return observers, found, relative, distances
 
 
+@njit(error_model="numpy", cache=True)
+def find_occluded(
+    observers: NDArray[np.int64],
+    bodies: NDArray[np.int64],
+    positions: NDArray[np.float64],
+    radii: NDArray[np.float64],
+    ends: NDArray[np.int64],
+    near_bodies: NDArray[np.int64],
+    near_positions: NDArray[np.float64],
+) -> NDArray[np.bool_]:
+    """:func:`sb3_flock.sim.visibility.find_occluded`, one contact after the other."""
+    hidden = np.zeros(len(observers), np.bool_)
+    for contact in range(len(observers)):
+        observer, x, y = observers[contact], positions[contact, 0], positions[contact, 1]
+        square = x * x + y * y
+        width = radii[contact] * math.sqrt(square)
+        for near in range(ends[observer - 1] if observer else 0, ends[observer]):
+            near_x, near_y = near_positions[near, 0], near_positions[near, 1]
+            along, across = x * near_x + y * near_y, abs(x * near_y - y * near_x)
+            if near_bodies[near] != bodies[contact] and 0 < along < square and across < width:
+                hidden[contact] = True
+                break
+    return hidden
+
+
 @njit(error_model="numpy", inline="always")
 def _cell(column: int, row: int, size: int) -> int:
     """The number below ``size``, a power of two, of a cell."""

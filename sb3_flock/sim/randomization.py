@@ -23,7 +23,7 @@ class FlockValues:
     :param settings: the group; ``None`` is :data:`UNBOUNDED`
     :param drawn: values of some fields by name, one a flock, ``(flocks,)``
 
-    :ivar are_drawn: whether any value differs between flocks
+    :ivar are_drawn: whether the values of any field are
     """
 
     def __init__(self, settings: Settings, drawn: Mapping[str, NDArray[np.float64]] | None = None) -> None:
@@ -32,6 +32,7 @@ class FlockValues:
             name: np.full((1, 1), UNBOUNDED if value is None else value, dtype=np.float64) for name, value in fixed.items()
         }
         self._values.update({name: np.asarray(values, np.float64)[:, None] for name, values in (drawn or {}).items()})
+        self._active = set(drawn or ()) | {name for name, value in fixed.items() if value != getattr(type(settings)(), name)}
         self.are_drawn = bool(drawn)
 
     def __getattr__(self, name: str) -> NDArray[np.float64]:
@@ -39,6 +40,10 @@ class FlockValues:
         if name.startswith("_") or name not in self._values:
             raise AttributeError(name)
         return self._values[name]
+
+    def is_on(self, name: str) -> bool:
+        """Whether a field is drawn or differs from its default; no flock's values decide for another."""
+        return name in self._active
 
     def of_flocks(self, name: str, n_flocks: int) -> NDArray[np.float64]:
         """The values of a field, one a flock, ``(flocks,)``."""

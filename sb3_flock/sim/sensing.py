@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -99,6 +99,17 @@ class Contacts:
         return self.shape[0] * self.shape[1]
 
 
+class Bodies(NamedTuple):
+    """Where the bodies of every flock are."""
+
+    positions: NDArray[np.float64]
+    """Of the vehicles, ``(flocks, vehicles, 2)`` [m]."""
+    frames: NDArray[np.float64]
+    """Cosine and sine of their headings, ``(flocks, vehicles, 2)``."""
+    obstacle_positions: NDArray[np.float64]
+    """``(flocks, obstacles, 2)`` [m]."""
+
+
 @dataclass(frozen=True)
 class Sensing:
     """What every vehicle senses, in its own body frame: forward is +x, left is +y. Distances in meters."""
@@ -187,17 +198,21 @@ def share_detections(
     :param frames: cosine and sine of their headings, ``(flocks, vehicles, 2)``
     :param obstacle_positions: ``(flocks, obstacles, 2)`` [m]
     """
-    n_obstacles, counts = obstacle_positions.shape[1], detected.count().ravel()
+    n_obstacles = obstacle_positions.shape[1]
+    observers, bodies = np.divmod(shared_keys(neighbors, detected, n_obstacles), n_obstacles)
+    flocks = observers // positions.shape[1]
+    offsets = obstacle_positions[flocks, bodies] - positions.reshape(-1, 2)[observers]
+    return Contacts(detected.shape, observers, bodies, to_body(offsets, frames.reshape(-1, 2)[observers]), _norm(offsets))
+
+
+def shared_keys(neighbors: Contacts, detected: Contacts, n_obstacles: int) -> NDArray[np.int64]:
+    """Which obstacles each vehicle or one of its neighbors detects: ascending numbers observer * n_obstacles + obstacle."""
+    counts = detected.count().ravel()
     shared = counts[neighbors.vehicles]  # how many obstacles each neighbor detects
     first = np.repeat((np.cumsum(counts) - counts)[neighbors.vehicles] - (np.cumsum(shared) - shared), shared)
     bodies = detected.bodies[first + np.arange(len(first))]
     observers = np.concatenate((detected.observers, np.repeat(neighbors.observers, shared)))
-    observers, bodies = np.divmod(
-        np.unique(observers * n_obstacles + np.concatenate((detected.bodies, bodies))), n_obstacles
-    )
-    flocks = observers // positions.shape[1]
-    offsets = obstacle_positions[flocks, bodies] - positions.reshape(-1, 2)[observers]
-    return Contacts(detected.shape, observers, bodies, to_body(offsets, frames.reshape(-1, 2)[observers]), _norm(offsets))
+    return np.unique(observers * n_obstacles + np.concatenate((detected.bodies, bodies)))
 
 
 def compensate_ego_motion(positions: NDArray[np.float64], ego_motion: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -39,7 +39,7 @@ class Unicycle(VehicleDynamics):
     @property
     def is_random(self) -> bool:  # type: ignore[override]
         """Whether there is slip or disturbance."""
-        return bool((self.actuators.slip > 0).any() or (self.actuators.disturbance > 0).any())
+        return self.actuators.is_on("slip") or self.actuators.is_on("disturbance")
 
     def reset(self, rngs: Sequence[Generator]) -> None:
         """Start an episode in every flock."""

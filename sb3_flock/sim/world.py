@@ -15,7 +15,7 @@ from sb3_flock.sim import dynamics
 from sb3_flock.sim.backend import compiled
 from sb3_flock.sim.dynamics import DYNAMICS, VehicleDynamics, directions_of, wrap_angle
 from sb3_flock.sim.safety import SafetySettings, filter_actions
-from sb3_flock.sim.sensing import Sensing, sense, to_body
+from sb3_flock.sim.sensing import Bodies, Sensing, sense, to_body
 from sb3_flock.sim.sensors import Sensors
 from sb3_flock.sim.unicycle import Unicycle  # noqa: F401 - registers the default dynamics
 
@@ -135,7 +135,7 @@ class World:
     def __init__(self, scenario: WorldSettings, n_flocks: int = 1, safety: SafetySettings | None = None) -> None:
         self.scenario, self._safety = scenario, safety
         self.n_flocks = n_flocks
-        self.sensors = Sensors(scenario)
+        self.sensors = Sensors(scenario, scenario, lambda: Bodies(self.positions, self.frames, self.obstacle_positions))
         self.dynamics: VehicleDynamics = DYNAMICS[scenario.dynamics](scenario)
         self.steps = scenario.max_cycles  # no episode is running before the first reset
         self.action_low = np.array([0.0, -scenario.max_turn_rate])
