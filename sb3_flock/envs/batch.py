@@ -30,6 +30,7 @@ def copy_flocks(world: World, flocks: NDArray[np.int64] | slice, into: World) ->
         **{name: value[flocks] for name, value in state["dynamics"].items() if name != "rngs"},
         "rngs": [rngs[flock] for flock in np.arange(world.n_flocks)[flocks]] if rngs else [],
     }
+    state["drawn"] = {name: values[flocks] for name, values in state["drawn"].items()}
     into.n_flocks = len(state["positions"])
     into.load_state_dict(state)
 

@@ -7,11 +7,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sb3_flock.settings import Settings, SettingsError, format_value, suggest
+
 if TYPE_CHECKING:
     from numpy.random import Generator
     from numpy.typing import NDArray
 
-    from sb3_flock.settings import Settings
+Ranges = Mapping[str, Sequence[float]]
+"""The lowest and the highest value of each randomized field, by the field's name with its group, such as
+``actuators.speed_lag``."""
 
 UNBOUNDED = 1e300
 """Stands for a bound that is ``None``: no product of it with a length or a time of the package overflows."""
@@ -48,6 +52,34 @@ class FlockValues:
     def of_flocks(self, name: str, n_flocks: int) -> NDArray[np.float64]:
         """The values of a field, one a flock, ``(flocks,)``."""
         return np.ascontiguousarray(np.broadcast_to(self._values[name][:, 0], (n_flocks,)))
+
+
+def check_ranges(ranges: Ranges, groups: Mapping[str, Settings]) -> None:
+    """Check that every range is of a field that can be randomized, and within the field's own bounds.
+
+    :param groups: the groups of fields that can be randomized, by name
+    :raises SettingsError: one line for the first that is not
+    """
+    known = [f"{name}.{field}" for name, group in groups.items() for field in type(group).model_fields]
+    for name, limits in ranges.items():
+        shown = f"randomization.{name} = {format_value(list(limits))}"
+        if name not in known:
+            raise SettingsError(f"{shown}: the name of a field of {' or '.join(groups)} is needed{suggest(name, known)}")
+        if len(limits) != 2 or limits[0] > limits[1]:
+            raise SettingsError(f"{shown}: input should be the lowest and the highest value")
+        group, _, field = name.partition(".")
+        for value in limits:
+            try:
+                groups[group].replace(**{field: value})
+            except SettingsError as error:
+                raise SettingsError(f"{shown}: {str(error).partition(': ')[2]}") from None
+
+
+def draw(ranges: Ranges, rngs: Sequence[Generator]) -> dict[str, NDArray[np.float64]]:
+    """A value of each randomized field for each flock, ``(flocks,)``, uniform in its range, by the flock's own generator."""
+    names = sorted(ranges)
+    values = np.array([[rng.uniform(ranges[name][0], ranges[name][1]) for name in names] for rng in rngs])
+    return {name: values[:, number].copy() for number, name in enumerate(names)}
 
 
 def own_rngs(rngs: Sequence[Generator]) -> list[Generator]:

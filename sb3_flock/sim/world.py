@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from pydantic import Field, model_validator
 
-from sb3_flock.settings import ActionError, Coordinate, NotNegative, Positive, UserError
+from sb3_flock.settings import ActionError, Coordinate, NotNegative, Positive, SettingsError, UserError
 from sb3_flock.sim import dynamics
 from sb3_flock.sim.backend import compiled
 from sb3_flock.sim.dynamics import DYNAMICS, VehicleDynamics, directions_of, wrap_angle
+from sb3_flock.sim.randomization import FlockValues, Ranges, check_ranges, draw
 from sb3_flock.sim.safety import SafetySettings, filter_actions
 from sb3_flock.sim.sensing import Bodies, Sensing, sense, to_body
 from sb3_flock.sim.sensors import Sensors
@@ -71,6 +72,20 @@ class WorldSettings(SafetySettings):
         return self.arena if self.obstacle_arena is None else self.obstacle_arena
 
 
+def check_randomization(ranges: Ranges, settings: WorldSettings) -> None:
+    """Check the ranges of randomized fields for a scenario.
+
+    :raises SettingsError: one line for the first that is not accepted
+    """
+    check_ranges(ranges, {"sensors": settings.sensors, "actuators": settings.actuators})
+    _, fastest = ranges.get("actuators.min_speed", (0.0, 0.0))
+    if fastest > settings.max_speed:
+        raise SettingsError(
+            f"randomization.actuators.min_speed = {list(ranges['actuators.min_speed'])}: input should be at most "
+            f"max_speed = {settings.max_speed}"
+        )
+
+
 _EPISODE = (
     "positions",
     "headings",
@@ -115,6 +130,8 @@ class World:
     :param scenario: the task, a :class:`~sb3_flock.sim.Scenario`
     :param n_flocks: number of flocks, at least 1
     :param safety: the filters and their separations, if they are not the scenario's
+    :param randomization: ranges from which fields of ``sensors`` and ``actuators`` are drawn for each flock and episode
+    :raises SettingsError: for a range that is not accepted
     """
 
     positions: NDArray[np.float64]
@@ -132,11 +149,22 @@ class World:
     steps: int
     """Steps taken since the reset, k."""
 
-    def __init__(self, scenario: WorldSettings, n_flocks: int = 1, safety: SafetySettings | None = None) -> None:
-        self.scenario, self._safety = scenario, safety
+    drawn: dict[str, NDArray[np.float64]]
+    """The randomized fields' values in the current episode by name, ``(flocks,)`` each."""
+
+    def __init__(
+        self,
+        scenario: WorldSettings,
+        n_flocks: int = 1,
+        safety: SafetySettings | None = None,
+        randomization: Ranges | None = None,
+    ) -> None:
+        self.scenario, self._safety, self.randomization = scenario, safety, dict(randomization or {})
+        check_randomization(self.randomization, scenario)
         self.n_flocks = n_flocks
         self.sensors = Sensors(scenario, scenario, lambda: Bodies(self.positions, self.frames, self.obstacle_positions))
         self.dynamics: VehicleDynamics = DYNAMICS[scenario.dynamics](scenario)
+        self.drawn = {}
         self.steps = scenario.max_cycles  # no episode is running before the first reset
         self.action_low = np.array([0.0, -scenario.max_turn_rate])
         self.action_high = np.array([scenario.max_speed, scenario.max_turn_rate])
@@ -173,6 +201,8 @@ class World:
 
         :param ego_motion: :attr:`Sensing.ego_motion`; ``None`` at the start
         """
+        if ego_motion is None and not self.dynamics.is_plain:  # as wide as after a step
+            ego_motion = np.zeros((*self.headings.shape, 3))
         return sense(self.positions, self.frames, self.obstacle_positions, self.waypoints, self.scenario, ego_motion)
 
     def reset(self, rngs: Sequence[Generator]) -> Sensing:
@@ -196,6 +226,8 @@ class World:
         walks = [self._walk(rng) for rng in rngs]
         self.obstacle_speeds = np.stack([speeds for speeds, _ in walks], axis=1)
         self.obstacle_turn_rates = np.stack([turns for _, turns in walks], axis=1) * scenario.obstacle_turn_std
+        if self.randomization:
+            self._use(draw(self.randomization, rngs))
         self.sensors.reset(rngs)
         self.dynamics.reset(rngs)
         self.steps = 0
@@ -233,6 +265,7 @@ class World:
             "steps": self.steps,
             "sensors": self.sensors.state_dict(),
             "dynamics": self.dynamics.state_dict(),
+            "drawn": self.drawn,
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -256,11 +289,24 @@ class World:
                 raise ValueError(f"{name} has the shape {state[name].shape}: {shape} is needed")
             setattr(self, name, np.array(state[name], dtype=np.float64))
         self.steps = int(state["steps"])
+        drawn = state.get("drawn", {})
+        if drawn or self.drawn:
+            self._use({name: np.array(values, dtype=np.float64) for name, values in drawn.items()})
         self.sensors.load_state_dict(state["sensors"])
         if "dynamics" in state:
             self.dynamics.load_state_dict(state["dynamics"])
         else:  # of an earlier version, whose vehicles had no state of their own
             self.dynamics.reset([np.random.default_rng(0) for _ in range(flocks)])
+
+    def _use(self, drawn: dict[str, NDArray[np.float64]]) -> None:
+        """Let the sensors and the dynamics have drawn values."""
+
+        def of_group(group: str) -> dict[str, NDArray[np.float64]]:
+            return {name.removeprefix(group): values for name, values in drawn.items() if name.startswith(group)}
+
+        self.drawn = drawn
+        self.sensors.errors = FlockValues(self.scenario.sensors, of_group("sensors."))
+        self.dynamics.actuators = FlockValues(self.scenario.actuators, of_group("actuators."))
 
     def _move(self, controls: NDArray[np.float64]) -> NDArray[np.float64]:
         """Vehicles by their controls ``(flocks, vehicles, 2)`` [m/s, rad/s], obstacles by drawn ones, and the waypoint.

@@ -194,7 +194,13 @@ def make_training_env(config: TrainingConfig) -> ParameterSharingVecEnv:
 def _make_flocks(config: TrainingConfig, scenario: Scenario, n_flocks: int) -> parallel_env:
     train_env, safety = config.train_env, config.training_safety(scenario)
     if train_env.expert is None:
-        return parallel_env(scenario, n_flocks=n_flocks, action_repeat=train_env.action_repeat, safety=safety)
+        return parallel_env(
+            scenario,
+            n_flocks=n_flocks,
+            action_repeat=train_env.action_repeat,
+            safety=safety,
+            randomization=train_env.randomization,
+        )
     make_expert = EXPERTS[train_env.expert]
     return ExpertEnv(
         scenario,
@@ -205,6 +211,7 @@ def _make_flocks(config: TrainingConfig, scenario: Scenario, n_flocks: int) -> p
         n_flocks=n_flocks,
         action_repeat=train_env.action_repeat,
         safety=safety,
+        randomization=train_env.randomization,
     )
 
 
