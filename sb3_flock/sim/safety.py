@@ -8,6 +8,7 @@ has the proof, what each level needs to know, and what can be guaranteed about o
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -92,6 +93,8 @@ class SafetySettings(SensingSettings, SensorSettings):
         harmless = {"turn_lag", "max_turn_acceleration"}  # a filtered vehicle may turn as it likes
         if self.safety_filter != "motion":
             harmless.add("odometry_noise")
+        if self.sensors.field_of_view >= math.pi:  # no vehicle approaches what is behind it
+            harmless.add("field_of_view")
         for name, group in (("actuators", self.actuators), ("sensors", self.sensors)):
             exact = type(group)()
             limits += [

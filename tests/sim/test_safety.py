@@ -259,6 +259,15 @@ def provoke(vehicle_steps, seed):
     return simulated
 
 
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**31), st.integers(2, 40), st.sampled_from(FILTERS), st.sampled_from(DRIVERS), st.booleans())
+def test_a_view_of_half_the_circle_keeps_the_guarantee(seed, n_vehicles, safety_filter, driver, is_packed):
+    """A vehicle never moves backwards, and a neighbor that sees it from behind knows no more of it than it may use."""
+    scenario = random_task(np.random.default_rng(seed), n_vehicles, safety_filter).replace(sensors={"field_of_view": np.pi})
+    assert scenario.guarantee_limits == ()
+    simulate(scenario, driver, 2, seed, is_packed)
+
+
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**31), st.integers(2, 40), st.sampled_from(FILTERS), st.sampled_from(DRIVERS), st.booleans())
 def test_no_pair_ends_a_step_nearer_than_its_separation(seed, n_vehicles, safety_filter, driver, is_packed):
@@ -332,6 +341,9 @@ def test_what_ends_the_guarantee_is_named():
         "actuators.min_speed = 0.05",
         "sensors.position_noise = 0.01",
     )
+    assert filtered("voronoi", sensors={"field_of_view": 3.0}).guarantee_limits == ("sensors.field_of_view = 3",)
+    assert filtered("voronoi", sensors={"odometry_noise": 0.1}).guarantee_limits == ()
+    assert filtered("motion", sensors={"odometry_noise": 0.1}).guarantee_limits == ("sensors.odometry_noise = 0.1",)
     assert Scenario(obstacle_filter=True, actuators={"disturbance": 0.01}).guarantee_limits == (
         "actuators.disturbance = 0.01",
     )
