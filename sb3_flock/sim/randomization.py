@@ -36,7 +36,8 @@ class FlockValues:
             name: np.full((1, 1), UNBOUNDED if value is None else value, dtype=np.float64) for name, value in fixed.items()
         }
         self._values.update({name: np.asarray(values, np.float64)[:, None] for name, values in (drawn or {}).items()})
-        self._active = set(drawn or ()) | {name for name, value in fixed.items() if value != getattr(type(settings)(), name)}
+        default = type(settings)()
+        self._active = set(drawn or ()) | {name for name, value in fixed.items() if value != getattr(default, name)}
         self.are_drawn = bool(drawn)
 
     def __getattr__(self, name: str) -> NDArray[np.float64]:

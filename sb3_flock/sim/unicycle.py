@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from numpy.random import Generator
     from numpy.typing import NDArray
 
+    from sb3_flock.sim.dynamics import DynamicsSettings
+
 
 @register_dynamics("unicycle")
 class Unicycle(VehicleDynamics):
@@ -31,10 +33,14 @@ class Unicycle(VehicleDynamics):
     rates: NDArray[np.float64]
     """Actual speed [m/s] and turn rate [rad/s], ``(flocks, vehicles, 2)``."""
 
+    def __init__(self, settings: DynamicsSettings) -> None:
+        super().__init__(settings)
+        self._are_papers = settings.actuators == Actuators()
+
     @property
     def is_plain(self) -> bool:  # type: ignore[override]
         """Whether the actuators are the paper's."""
-        return self.settings.actuators == Actuators() and not self.actuators.are_drawn
+        return self._are_papers and not self.actuators.are_drawn
 
     @property
     def is_random(self) -> bool:  # type: ignore[override]

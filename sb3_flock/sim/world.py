@@ -315,12 +315,12 @@ class World:
         """
         is_plain, dt = self.dynamics.is_plain, self.scenario.time_step
         ego_motion = controls * dt if is_plain else self._move_vehicles(controls)
-        vehicles = slice(None) if is_plain else slice(0)
+        vehicles = self.positions, self.frames, self.headings, controls
+        if not is_plain:  # the vehicles have moved
+            positions, frames, headings, controls = vehicles
+            vehicles = positions[:, :0], frames[:, :0], headings[:, :0], controls[:, :0]
         positions, headings, self.obstacle_positions, self.obstacle_headings = (compiled() or dynamics).move_bodies(
-            self.positions[:, vehicles],
-            self.frames[:, vehicles],
-            self.headings[:, vehicles],
-            controls[:, vehicles],
+            *vehicles,
             self.obstacle_positions,
             directions_of(self.obstacle_headings),
             self.obstacle_headings,
