@@ -1,49 +1,39 @@
-"""Vehicle dynamics of your own in the env: actuators that follow the commands with a lag."""
+"""Vehicle dynamics of your own, by name in training, evaluation and pictures: a double integrator, which drifts in curves."""
 
 import sys
 
 import numpy as np
-from stable_baselines3.common.evaluation import evaluate_policy
 
-from sb3_flock import CompactReplayBuffer, FlockDDPG, FlockPolicy, NeighborInclusiveReward, Scenario, World, flatten
-from sb3_flock.envs import flocking_v0
+from sb3_flock import TrainingConfig, VehicleDynamics, World, evaluate, load_policy, register_dynamics, render, train
+from sb3_flock.sim.dynamics import directions_of, turn
 
 
-class LaggingWorld(World):
-    """A world whose vehicles' speeds and turn rates close a share of the gap to their commands in each step."""
+@register_dynamics("double-integrator")
+class DoubleIntegrator(VehicleDynamics):
+    """The velocity changes towards the commanded one, along the heading, by at most the acceleration's bound."""
 
-    share = 0.4
+    memory = ("velocities",)
 
     def reset(self, rngs):
-        self.rates = np.zeros((self.n_flocks, self.scenario.n_vehicles, 2))
-        return super().reset(rngs)
+        super().reset(rngs)
+        self.velocities = np.zeros((len(rngs), self.settings.n_vehicles, 2))
 
-    def step(self, actions):
-        commands = np.clip(np.asarray(actions, dtype=np.float64), self.action_low, self.action_high)
-        self.rates = self.rates + self.share * (commands - self.rates)
-        return super().step(self.rates)
-
-
-class LaggingEnv(flocking_v0.parallel_env):
-    """The flocking env in this world."""
-
-    def __init__(self, scenario):
-        super().__init__(scenario)
-        self.world = LaggingWorld(scenario)
+    def step(self, positions, headings, commands, dt):
+        changes = commands[..., :1] * directions_of(headings) - self.velocities
+        lengths = np.maximum(np.linalg.norm(changes, axis=-1), 1e-12)
+        changes = changes * np.minimum(1.0, self.actuators.max_acceleration * dt / lengths)[..., None]
+        positions = positions + (self.velocities + changes / 2) * dt
+        self.velocities = self.velocities + changes
+        return positions, turn(headings, commands[..., 1], dt)
 
 
-steps = int(sys.argv[1]) if len(sys.argv) > 1 else 100_000
-scenario = Scenario(n_vehicles=3, n_obstacles=1)
-env = LaggingEnv(scenario)
-env.reset(seed=0)
-start = env.world.positions[0, 0]
-env.step(dict.fromkeys(env.agents, (scenario.max_speed, 0.0)))
-speed = np.linalg.norm(env.world.positions[0, 0] - start) / scenario.time_step
-print(f"speed in the first step: {speed:.3f} m/s of the commanded {scenario.max_speed:.3f} m/s")
-
-options: dict = dict(
-    replay_buffer_class=CompactReplayBuffer, learning_starts=1000, buffer_size=50_000, gradient_steps=5, seed=0
-)
-model = FlockDDPG(FlockPolicy, flatten(env, n_copies=8, seed=0), **options)
-model.learn(steps, NeighborInclusiveReward(lambda_=0.7))
-print(f"mean return {evaluate_policy(model, flatten(env, 4, seed=1), n_eval_episodes=24, warn=False)[0]:.2f}")
+steps = int(sys.argv[1]) if len(sys.argv) > 1 else 150_000
+scenario = {"dynamics": "double-integrator", "actuators": {"max_acceleration": 0.3}, "safety_filter": "off"}
+policy = load_policy(train(TrainingConfig(scenario=scenario, total_timesteps=steps, n_flocks=8, eval_freq=0)).folder)
+world = World(policy.scenario)
+start = world.reset([np.random.default_rng(0)])
+print(f"speed in the first step: {np.hypot(*world.step([[[0.15, 0.0]] * 3])[0].ego_motion[0, 0, ::2]) / 0.1:.3f} m/s")
+for name in ("double-integrator", "unicycle"):
+    metrics = evaluate(policy, policy.scenario.replace(dynamics=name), episodes=50)
+    print(f"{name:>17}: tracking error {metrics['tracking_error'].mean:.3f} m")
+print(render(policy, policy.scenario, "extend_dynamics.png"))

@@ -33,7 +33,15 @@ if TYPE_CHECKING:
     from sb3_flock.rl.torch_layers import FlockCNN
     from sb3_flock.serialization.load import load_policy
     from sb3_flock.serialization.save import save_model
-    from sb3_flock.sim import RewardWeights, Scenario, World, register_channel, register_reward_term
+    from sb3_flock.sim import (
+        RewardWeights,
+        Scenario,
+        VehicleDynamics,
+        World,
+        register_channel,
+        register_dynamics,
+        register_reward_term,
+    )
     from sb3_flock.training.eval_callback import FlockEvalCallback
     from sb3_flock.training.train import resume, train
     from sb3_flock.viz.video import render
@@ -54,6 +62,7 @@ __all__ = [
     "Scenario",
     "TrainingConfig",
     "VecNeighborInclusiveReward",
+    "VehicleDynamics",
     "World",
     "evaluate",
     "export",
@@ -67,6 +76,7 @@ __all__ = [
     "register_algorithm",
     "register_channel",
     "register_controller",
+    "register_dynamics",
     "register_metric",
     "register_reward_term",
     "render",
@@ -91,6 +101,7 @@ _HOMES = {
     "Scenario": "sim",
     "TrainingConfig": "config.training",
     "VecNeighborInclusiveReward": "envs.vec_reward",
+    "VehicleDynamics": "sim",
     "World": "sim",
     "evaluate": "evaluation",
     "export": "deploy.onnx_export",
@@ -103,6 +114,7 @@ _HOMES = {
     "register_algorithm": "rl.registry",
     "register_channel": "sim",
     "register_controller": "controllers",
+    "register_dynamics": "sim",
     "register_metric": "evaluation",
     "register_reward_term": "sim",
     "render": "viz.video",

@@ -126,10 +126,13 @@ def test_a_parameter_of_ones_own_is_validated_and_takes_effect(tmp_path):
     assert "weight_decay = -1: input should be greater than or equal to 0" in failure.value.stderr
 
 
-def test_dynamics_of_ones_own_move_the_vehicles(tmp_path):
-    output = run("dynamics", 1600, cwd=tmp_path)
-    assert "speed in the first step: 0.060 m/s of the commanded 0.150 m/s" in output
-    assert float(re.search(r"mean return (-?[\d.]+)", output)[1]) < 0
+def test_dynamics_of_ones_own_train_evaluate_and_render(tmp_path):
+    output = run("dynamics", 3300, cwd=tmp_path)
+    assert "speed in the first step: 0.015 m/s" in output  # the mean of 0 and 0.03
+    errors = {name: float(error) for name, error in re.findall(r"(\S+): tracking error ([\d.]+) m", output)}
+    assert list(errors) == ["double-integrator", "unicycle"]
+    assert "dynamics: double-integrator" in next(tmp_path.glob("runs/*/config.yaml")).read_text()
+    assert (tmp_path / "extend_dynamics.png").read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "examples").glob("extend_*.py")), ids=lambda path: path.stem)

@@ -17,12 +17,16 @@ def add(parser: Parser) -> None:
     parser.describe(
         "runs/ddpg_5v2o_1 --n-vehicles 8 -o result.json",
         description="Simulate many episodes of a saved policy at once and print every metric with its interval.",
-        renamed={**shared.ROLLOUT_RENAMED, "--json": "--output"},
+        renamed={**shared.ROLLOUT_RENAMED, "--json": "--output", "--sensors": "--robustness"},
     )
     shared.add_rollout(parser)
     parser.add_argument("-n", "--episodes", type=count(1), default=1000, metavar="N", help="number of episodes [1000]")
     shared.add_output(parser, "also write the metrics to this file, as JSON")
-    parser.add_argument("--sensors", action="store_true", help="also show the effect of noise, missed detections and delay")
+    parser.add_argument(
+        "--robustness",
+        action="store_true",
+        help="also show the effect of sensor errors, of lag, bounded acceleration and slip, and of several at once",
+    )
 
 
 def run(options: argparse.Namespace, words: Sequence[str]) -> int:
@@ -34,11 +38,11 @@ def run(options: argparse.Namespace, words: Sequence[str]) -> int:
     controller, name, scenario = shared.rollout_of(options)
     console = PlainConsole(stderr=True)
     metrics = shared.evaluate_and_print(controller, name, scenario, options.episodes, options.seed, console)
-    if options.sensors:
-        from sb3_flock.evaluation.robustness import errors_table, evaluate_with_errors
+    if options.robustness:
+        from sb3_flock.evaluation.robustness import errors_table, evaluate_robustness
 
-        with console.status("simulating sensor errors"):
-            PlainConsole().print(errors_table(evaluate_with_errors(controller, scenario, options.episodes, options.seed)))
+        with console.status("simulating sensor errors and other dynamics"):
+            PlainConsole().print(errors_table(evaluate_robustness(controller, scenario, options.episodes, options.seed)))
     if options.output is not None:
         from sb3_flock.evaluation.report import write_json
         from sb3_flock.serialization.save import versions

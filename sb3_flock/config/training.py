@@ -14,7 +14,11 @@ from sb3_flock.rl.registry import ModelSettings
 from sb3_flock.rl.settings import Count, Width
 from sb3_flock.settings import NotNegative, Positive, Settings, SettingsError, suggest
 from sb3_flock.sim import Scenario
+from sb3_flock.sim.actuators import Actuators
 from sb3_flock.sim.dynamics import MAX_BODIES, ObstacleMotion
+from sb3_flock.sim.randomization import check_ranges
+from sb3_flock.sim.sensors import SensorErrors
+from sb3_flock.sim.world import check_randomization
 
 TRAINING_TASK: dict[str, Any] = {"safety_filter": "announce", "shared_detections": True}
 """What a training's task has, unless it says otherwise, in place of the defaults of :class:`~sb3_flock.sim.Scenario`, which are
@@ -57,6 +61,12 @@ class TrainEnvConfig(Settings):
     obstacle_separation_scale: float | None = Field(
         1.08, ge=1, le=1e6, description="the same for obstacles; null: separation_scale (paper: 1)"
     )
+    randomization: dict[str, tuple[float, float]] = Field(
+        {},
+        description="domain randomization: [lowest, highest] value of fields of scenario.sensors and scenario.actuators by name, "
+        "such as {actuators.speed_lag: [0, 0.3]}, drawn for each flock and episode; the expert and the reward see the truth "
+        "(paper: none)",
+    )
     expert: str | None = Field(
         None,
         description="expert to learn from: mpc (plans for the whole flock from the full state), orca, olfati-saber; "
@@ -69,6 +79,16 @@ class TrainEnvConfig(Settings):
         0.1, description="standard deviation of the noise on the expert's actions [half the action range]"
     )
     mpc: MPCConfig = Field(default_factory=MPCConfig, description="the cost and the optimizer of the expert mpc")
+
+    @field_validator("randomization")
+    @classmethod
+    def _ranges_are_of_fields(cls, ranges: dict[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
+        check_ranges(ranges, {"sensors": SensorErrors(), "actuators": Actuators()})
+        return ranges
+
+    def __hash__(self) -> int:
+        values = {name: getattr(self, name) for name in type(self).model_fields}
+        return hash((frozenset(values.pop("randomization").items()), *values.values()))
 
     @model_validator(mode="after")
     def _expert_is_known(self) -> TrainEnvConfig:
@@ -95,6 +115,11 @@ class TaskConfig(Settings):
     @classmethod
     def _has_a_filter(cls, value: Any) -> Any:
         return {**TRAINING_TASK, **value} if isinstance(value, Mapping) else value
+
+    @model_validator(mode="after")
+    def _ranges_fit_the_task(self) -> TaskConfig:
+        check_randomization(self.train_env.randomization, self.scenario)
+        return self
 
     @model_validator(mode="after")
     def _training_env_is_possible(self) -> TaskConfig:

@@ -66,7 +66,8 @@ class Velocities:
         within = at < len(self._keys)
         known[within] = self._keys[at[within]] == keys[within]
         velocities = np.zeros((len(keys), 2))
-        before = compensate_ego_motion(self._positions[at[known]], ego_motion.reshape(-1, 2)[contacts.observers[known]])
+        own_motion = ego_motion.reshape(-1, ego_motion.shape[-1])[contacts.observers[known]]
+        before = compensate_ego_motion(self._positions[at[known]], own_motion)
         velocities[known] = (contacts.positions[known] - before) / dt
         self._keys, self._positions = keys, contacts.positions
         return velocities

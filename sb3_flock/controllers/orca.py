@@ -60,8 +60,9 @@ class Orca(Controller):
         own_radius = scenario.neighbor_separation / 2 + gains.margin / 2
         obstacle_radius = max(0.0, scenario.obstacle_separation + gains.margin - own_radius)
         preferred = limit(gains.approach * sensing.waypoint_positions, speed).reshape(-1, 2)
-        forward, turns = sensing.ego_motion.reshape(-1, 2).T
-        velocities = rotate(np.stack((forward / dt, np.zeros_like(forward)), axis=-1), -turns)
+        forward, turns, *across = np.moveaxis(sensing.ego_motion.reshape(-1, sensing.ego_motion.shape[-1]), -1, 0)
+        left = across[0] / dt if across else np.zeros_like(forward)
+        velocities = rotate(np.stack((forward / dt, left), axis=-1), -turns)
 
         sensing_range = 1.1 * max(
             scenario.link_range, scenario.detection_range

@@ -83,7 +83,7 @@ class VehicleController:
         self.obstacles = [Body(f"obstacle {number}", scenario.obstacle_max_speed) for number in range(scenario.n_obstacles)]
         self.waypoint = Body("the waypoint", scenario.waypoint_speed)
         self._announcing = self.scenario.replace(safety_filter="heading") if self.announces else self.scenario
-        self._sensors = Sensors(self.scenario)
+        self._sensors = Sensors(self.scenario, self.scenario)
         self._bounds = (0.0, -scenario.max_turn_rate), (scenario.max_speed, scenario.max_turn_rate)
         self._before: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
         self._cycle: tuple[NDArray[np.float64], Sensing, NDArray[np.float64]] | None = None

@@ -25,6 +25,12 @@ def copy_flocks(world: World, flocks: NDArray[np.int64] | slice, into: World) ->
     for name, value in state.items():
         if isinstance(value, np.ndarray):
             state[name] = value[:, flocks] if name in _BY_STEP else value[flocks]
+    rngs = state["dynamics"]["rngs"]
+    state["dynamics"] = {
+        **{name: value[flocks] for name, value in state["dynamics"].items() if name != "rngs"},
+        "rngs": [rngs[flock] for flock in np.arange(world.n_flocks)[flocks]] if rngs else [],
+    }
+    state["drawn"] = {name: values[flocks] for name, values in state["drawn"].items()}
     into.n_flocks = len(state["positions"])
     into.load_state_dict(state)
 

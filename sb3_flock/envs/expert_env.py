@@ -12,10 +12,12 @@ from sb3_flock.controllers import Controller
 from sb3_flock.envs.batch import copy_flocks, select_flocks
 from sb3_flock.envs.flocking_v0 import Observation, parallel_env
 from sb3_flock.sim import Scenario, Sensing, World
+from sb3_flock.sim.sensors import SensorErrors, Sensors
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
+    from sb3_flock.sim.randomization import Ranges
     from sb3_flock.sim.safety import SafetySettings
 
 
@@ -23,7 +25,8 @@ class ExpertEnv(parallel_env):
     """:class:`~sb3_flock.envs.flocking_v0.parallel_env` with an expert, as in DAgger's interactive collection.
 
     The expert drives a share of the episodes. In those the actions given to :meth:`step` are not executed. Which episodes the
-    expert drives, and the noise on its actions, are drawn from each flock's own random stream. The infos of a step also hold:
+    expert drives, and the noise on its actions, are drawn from each flock's own random stream. The expert senses without errors,
+    whatever the vehicles measure. The infos of a step also hold:
 
     * ``expert_drives``: whether the expert drives this episode;
     * ``executed_action``: in its episodes, the executed action ``(2,)`` [m/s, rad/s], unfiltered, which
@@ -38,6 +41,7 @@ class ExpertEnv(parallel_env):
     :param n_flocks: number of independent flocks
     :param action_repeat: sampling periods that a step takes, with the same actions
     :param safety: the filters and their separations, if they are not the scenario's
+    :param randomization: ranges of randomized fields, as in :class:`~sb3_flock.envs.flocking_v0.parallel_env`
     """
 
     def __init__(
@@ -50,8 +54,14 @@ class ExpertEnv(parallel_env):
         n_flocks: int = 1,
         action_repeat: int = 1,
         safety: SafetySettings | None = None,
+        randomization: Ranges | None = None,
     ) -> None:
-        super().__init__(scenario, n_flocks=n_flocks, action_repeat=action_repeat, safety=safety)
+        super().__init__(
+            scenario, n_flocks=n_flocks, action_repeat=action_repeat, safety=safety, randomization=randomization
+        )
+        exact = scenario.replace(sensors=SensorErrors())
+        has_errors = scenario != exact or any(name.startswith("sensors.") for name in self.world.randomization)
+        self._exact_sensors = Sensors(exact, exact) if has_errors else None
         acts_for_all = queries or n_flocks == 1
         self._seen = self.world if acts_for_all else World(scenario, safety=safety)
         self.expert, self.fraction, self.noise_std, self.queries = make_expert(self._seen), fraction, noise_std, queries
@@ -106,11 +116,16 @@ class ExpertEnv(parallel_env):
                 "next_actions": self._next_actions,
                 "memory": self.expert.state_dict(),
             }
-        return {**super().state_dict(), "expert": expert}
+        exact = {} if self._exact_sensors is None else {"exact_sensors": self._exact_sensors.state_dict()}
+        return {**super().state_dict(), "expert": expert, **exact}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore the episodes of :meth:`state_dict`."""
         super().load_state_dict(state)
+        if self._exact_sensors is not None:
+            self._exact_sensors.forget()
+            if "exact_sensors" in state:  # files of earlier versions do not have them
+                self._exact_sensors.load_state_dict(state["exact_sensors"])
         self._drives = np.zeros(self.n_copies, bool)
         self._expert_actions = self._next_actions = None
         if state["expert"] is not None:
@@ -119,9 +134,13 @@ class ExpertEnv(parallel_env):
             self.expert.load_state_dict(state["expert"]["memory"])
 
     def measure(self, sensing: Sensing) -> Sensing:
-        """What the vehicles measure, once a step; the expert decides on its next actions from the same measurement."""
-        measured = super().measure(sensing)
+        """What the vehicles measure, once a step; the expert decides on its next actions from what there is."""
+        measured = truth = super().measure(sensing)
         is_start = self.world.steps == 0
+        if self._exact_sensors is not None:
+            if is_start:
+                self._exact_sensors.forget()
+            truth = self._exact_sensors.measure(sensing)
         if is_start:
             self._drives = np.array([rng.random() < self.fraction for rng in self.rngs])
         self._expert_actions = self._next_actions = None
@@ -129,7 +148,7 @@ class ExpertEnv(parallel_env):
         if is_start:
             self.expert.reset([self.rngs[flock] for flock in flocks], self.scenario)
         if len(flocks):
-            seen = measured if len(flocks) == self.n_copies else select_flocks(measured, flocks)
+            seen = truth if len(flocks) == self.n_copies else select_flocks(truth, flocks)
             if self._seen is not self.world:
                 copy_flocks(self.world, flocks, self._seen)
             self._expert_actions = self.expert.act(seen, self.scenario)
@@ -137,6 +156,12 @@ class ExpertEnv(parallel_env):
             assert self._expert_actions is not None
             self._next_actions = self._noisy(self._expert_actions[self._drives] if self.queries else self._expert_actions)
         return measured
+
+    def remember(self, sensing: Sensing) -> None:
+        """Let the sensors measure between two steps of the env, also those of the expert."""
+        super().remember(sensing)
+        if self._exact_sensors is not None:
+            self._exact_sensors.measure(sensing)
 
     def _noisy(self, actions: NDArray[np.floating]) -> NDArray[np.float64]:
         """The actions for the flocks that the expert drives, each with noise from the flock's own stream."""

@@ -58,6 +58,7 @@ from sb3_flock.sim.sensing import is_connected, nearest
 if TYPE_CHECKING:
     from typing_extensions import Self
 
+    from sb3_flock.sim.randomization import Ranges
     from sb3_flock.sim.safety import SafetySettings
 
 Observation = NDArray[np.float32]
@@ -95,6 +96,8 @@ class parallel_env(ParallelEnv[str, Observation, Action]):  # noqa: N801 - Petti
     :param n_flocks: number of independent flocks
     :param action_repeat: sampling periods that a step takes, with the same actions; rewards are means over them
     :param safety: the filters and their separations, if they are not the scenario's; ``fields`` do not change it
+    :param randomization: ranges ``{"actuators.speed_lag": (0.0, 0.3)}`` from which fields of ``sensors`` and ``actuators`` are
+        drawn for each flock and episode
     :param fields: fields of :class:`~sb3_flock.Scenario` by name
     :raises SettingsError: for an unknown field, a value that is not accepted or an unknown render mode
 
@@ -116,6 +119,7 @@ class parallel_env(ParallelEnv[str, Observation, Action]):  # noqa: N801 - Petti
         n_flocks: int = 1,
         action_repeat: int = 1,
         safety: SafetySettings | None = None,
+        randomization: Ranges | None = None,
         **fields: Any,
     ) -> None:
         check_integer("n_flocks", n_flocks, least=1)
@@ -133,7 +137,7 @@ class parallel_env(ParallelEnv[str, Observation, Action]):  # noqa: N801 - Petti
         self.agents: list[str] = []
         self._observation_spaces = {name: observation_space(self.scenario) for name in vehicles}
         self._action_spaces = {name: action_space(self.scenario) for name in vehicles}
-        self.world = World(self.scenario, n_flocks, safety)
+        self.world = World(self.scenario, n_flocks, safety, randomization)
         self.rngs: list[np.random.Generator] = []
         self._renderer: Any = None
 
@@ -242,7 +246,7 @@ class parallel_env(ParallelEnv[str, Observation, Action]):  # noqa: N801 - Petti
         steps = min(self.action_repeat, self.scenario.max_cycles - self.world.steps)
         sensing, totals = self._advance_once(commands)
         for _ in range(steps - 1):
-            self.world.sensors.measure(sensing)  # the sensors remember every sampling period
+            self.remember(sensing)  # the sensors remember every sampling period
             sensing, terms = self._advance_once(commands)
             totals = {name: totals[name] + term for name, term in terms.items()}
         return sensing, {name: total / steps for name, total in totals.items()} if steps > 1 else totals
@@ -258,6 +262,10 @@ class parallel_env(ParallelEnv[str, Observation, Action]):  # noqa: N801 - Petti
     def measure(self, sensing: Sensing) -> Sensing:
         """What the vehicles measure of what there is; the env calls it once a step, before it returns the observations."""
         return self.world.sensors.measure(sensing)
+
+    def remember(self, sensing: Sensing) -> None:
+        """Let the sensors measure between two steps of the env, where nothing is decided."""
+        self.world.sensors.measure(sensing)
 
     def commands(self, actions: Mapping[str, ArrayLike]) -> NDArray[np.float64]:
         """The actions for the world, ``(flocks, vehicles, 2)`` [m/s, rad/s]; the env calls it once a step."""

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from multiprocessing.connection import wait
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import supersuit
@@ -36,6 +36,9 @@ from sb3_flock.envs.wrappers import check_parallel_env, layers_of, owner_of, wit
 from sb3_flock.settings import RunError, SettingsError, check_integer
 from sb3_flock.sim import Scenario, check_actions
 
+if TYPE_CHECKING:
+    from sb3_flock.sim.randomization import Ranges
+
 
 def make_vec_env(
     scenario: Scenario | None = None,
@@ -44,6 +47,7 @@ def make_vec_env(
     seed: int | None = None,
     render_mode: str | None = None,
     monitor: bool = False,
+    randomization: Ranges | None = None,
 ) -> ParameterSharingVecEnv:
     """Flocks of one scenario as an SB3 vector env with ``n_flocks * n_vehicles`` slots.
 
@@ -53,12 +57,15 @@ def make_vec_env(
     :param seed: seeds all flocks, each with a stream of its own, whatever ``num_cpus``
     :param render_mode: as in :class:`~sb3_flock.envs.flocking_v0.parallel_env`; the first flock is drawn
     :param monitor: as in :func:`flatten`
-    :raises SettingsError: for a count that is not accepted
+    :param randomization: ranges of randomized fields, as in :class:`~sb3_flock.envs.flocking_v0.parallel_env`
+    :raises SettingsError: for a count or a range that is not accepted
     """
     check_integer("n_flocks", n_flocks, least=1)
-    return flatten_batch(
-        lambda count: flocking_v0.parallel_env(scenario, render_mode, count), n_flocks, num_cpus, seed, monitor
-    )
+
+    def make_env(count: int) -> flocking_v0.parallel_env:
+        return flocking_v0.parallel_env(scenario, render_mode, count, randomization=randomization)
+
+    return flatten_batch(make_env, n_flocks, num_cpus, seed, monitor)
 
 
 def flatten_batch(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -130,6 +131,8 @@ def evaluate(
 ) -> dict[str, Metric]:
     """Evaluate a policy or any other controller.
 
+    It warns where the scenario has a safety filter that guarantees nothing, and names what ends the guarantee.
+
     :param policy: a :class:`Controller`, or anything with SB3's ``predict``
     :param scenario: the task; the default is the one a loaded policy was trained for
     :param episodes: number of episodes
@@ -141,4 +144,8 @@ def evaluate(
     scenario = scenario or getattr(policy, "scenario", None)
     if scenario is None:
         raise SettingsError("scenario = None: the policy carries none, so one is needed")
+    if scenario.guarantee_limits:
+        warnings.warn(
+            f"the safety filter guarantees no separation with {', '.join(scenario.guarantee_limits)}", stacklevel=2
+        )
     return summarize(rollout(as_controller(policy, scenario), scenario, episodes, seed, batch))

@@ -3,6 +3,7 @@
 from typing import Any
 
 from sb3_flock._renamed import renamed_member
+from sb3_flock.sim.dynamics import VehicleDynamics, register_dynamics
 from sb3_flock.sim.observation import Channel, observe, register_channel
 from sb3_flock.sim.reward import RewardWeights, mix_rewards, own_reward, register_reward_term, reward_terms
 from sb3_flock.sim.scenario import Scenario
@@ -15,6 +16,7 @@ __all__ = [
     "RewardWeights",
     "Scenario",
     "Sensing",
+    "VehicleDynamics",
     "World",
     "check_actions",
     "episode_rng",
@@ -22,6 +24,7 @@ __all__ = [
     "observe",
     "own_reward",
     "register_channel",
+    "register_dynamics",
     "register_reward_term",
     "reward_terms",
 ]

@@ -57,6 +57,50 @@ def _wrap_angle(angle: float) -> float:
     return angle - 2 * np.pi * math.floor((angle + np.pi) / (2 * np.pi))
 
 
+@njit(error_model="numpy", inline="always")
+def _follow(rate: float, command: float, lag: float, bound: float, dt: float) -> tuple[float, float]:
+    """:func:`sb3_flock.sim.actuators.follow` of one rate."""
+    gap, sign = abs(command - rate), np.sign(command - rate)
+    at_bound = min(max(gap / bound - lag, 0.0), dt)
+    left = max(gap - bound * at_bound, 0.0)
+    decay = math.expm1(-(dt - at_bound) / max(lag, 1e-300))
+    missed = (gap + left) / 2 * at_bound - left * lag * decay
+    return command - sign * (left + left * decay), command * dt - sign * missed
+
+
+@njit(error_model="numpy", cache=True)
+def step_unicycles(
+    positions: NDArray[np.float64],
+    directions: NDArray[np.float64],
+    headings: NDArray[np.float64],
+    rates: NDArray[np.float64],
+    commands: NDArray[np.float64],
+    noise: NDArray[np.float64],
+    values: NDArray[np.float64],
+    dt: float,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """:func:`sb3_flock.sim.unicycle.step_unicycles` in one pass; equal up to the rounding of the exponential."""
+    next_positions, next_headings = np.empty(positions.shape), np.empty(headings.shape)
+    next_rates = np.empty(rates.shape)
+    for flock in range(positions.shape[0]):
+        speed_lag, turn_lag, acceleration, turn_acceleration, min_speed, slip, disturbance = (
+            values[0, flock], values[1, flock], values[2, flock], values[3, flock], values[4, flock], values[5, flock],
+            values[6, flock],
+        )  # fmt: skip
+        drift = disturbance * np.sqrt(dt)
+        for i in range(positions.shape[1]):
+            asked = max(commands[flock, i, 0], min_speed)
+            speed, stride = _follow(rates[flock, i, 0], asked, speed_lag, acceleration, dt)
+            turn_rate, turn = _follow(rates[flock, i, 1], commands[flock, i, 1], turn_lag, turn_acceleration, dt)
+            stride *= max(1.0 + slip * noise[flock, i, 0], 0.0)
+            for axis in range(2):
+                moved = positions[flock, i, axis] + stride * directions[flock, i, axis]
+                next_positions[flock, i, axis] = moved + drift * noise[flock, i, 1 + axis]
+            next_headings[flock, i] = _wrap_angle(headings[flock, i] + turn)
+            next_rates[flock, i, 0], next_rates[flock, i, 1] = speed, turn_rate
+    return next_positions, next_headings, next_rates
+
+
 Found = tuple["NDArray[np.int64]", "NDArray[np.int64]", "NDArray[np.float64]", "NDArray[np.float64]"]
 """Observers, bodies, positions in the observers' frames and distances: the arrays of a ``Contacts``."""
 
@@ -180,6 +224,31 @@ def find_contacts_by_cell(
         observers[k], found[k], distances[k] = observer, j, math.sqrt(x * x + y * y)
         relative[k, 0], relative[k, 1] = cos * x + sin * y, cos * y - sin * x
     return observers, found, relative, distances
+
+
+@njit(error_model="numpy", cache=True)
+def find_occluded(
+    observers: NDArray[np.int64],
+    bodies: NDArray[np.int64],
+    positions: NDArray[np.float64],
+    radii: NDArray[np.float64],
+    ends: NDArray[np.int64],
+    near_bodies: NDArray[np.int64],
+    near_positions: NDArray[np.float64],
+) -> NDArray[np.bool_]:
+    """:func:`sb3_flock.sim.visibility.find_occluded`, one contact after the other."""
+    hidden = np.zeros(len(observers), np.bool_)
+    for contact in range(len(observers)):
+        observer, x, y = observers[contact], positions[contact, 0], positions[contact, 1]
+        square = x * x + y * y
+        width = radii[contact] * math.sqrt(square)
+        for near in range(ends[observer - 1] if observer else 0, ends[observer]):
+            near_x, near_y = near_positions[near, 0], near_positions[near, 1]
+            along, across = x * near_x + y * near_y, abs(x * near_y - y * near_x)
+            if near_bodies[near] != bodies[contact] and 0 < along < square and across < width:
+                hidden[contact] = True
+                break
+    return hidden
 
 
 @njit(error_model="numpy", inline="always")

@@ -8,6 +8,7 @@ has the proof, what each level needs to know, and what can be guaranteed about o
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -20,6 +21,8 @@ from sb3_flock.sim.sensors import SensorSettings
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+    from sb3_flock.sim.dynamics import Stopping
 
 ROUNDING = 1e-9
 """What the filter keeps beyond a separation for floating-point errors [separations]: enough while coordinates stay below
@@ -78,6 +81,29 @@ class SafetySettings(SensingSettings, SensorSettings):
         """Whether a filter is on."""
         return self.safety_filter != "off" or self.obstacle_filter
 
+    @property
+    def guarantee_limits(self) -> tuple[str, ...]:
+        """Which parameters end the guarantee of the filter that is on, as ``name = value``; empty if it holds.
+
+        The guarantee also needs starts that keep the separation, and vehicles that are all filtered: ``docs/safety.md``.
+        """
+        if not self.is_filtered:
+            return ()
+        limits = [f"dynamics = {self.dynamics}"] if self.dynamics != "unicycle" else []
+        harmless = {"turn_lag", "max_turn_acceleration"}  # a filtered vehicle may turn as it likes
+        if self.safety_filter != "motion":
+            harmless.add("odometry_noise")
+        if self.sensors.field_of_view >= math.pi:  # no vehicle approaches what is behind it
+            harmless.add("field_of_view")
+        for name, group in (("actuators", self.actuators), ("sensors", self.sensors)):
+            exact = type(group)()
+            limits += [
+                f"{name}.{field} = {getattr(group, field):g}"
+                for field in type(group).model_fields
+                if field not in harmless and getattr(group, field) != getattr(exact, field)
+            ]
+        return tuple(limits)
+
 
 def filter_actions(
     actions: NDArray[np.float64],
@@ -85,14 +111,19 @@ def filter_actions(
     settings: SafetySettings,
     frames: NDArray[np.float64] | None = None,
     use_numba: bool = True,
+    stopping: Stopping | None = None,
 ) -> NDArray[np.float64]:
     """The actions with their speeds bounded; each vehicle uses what it senses, and with ``announce`` what neighbors announce.
+
+    Vehicles that cannot stop at once keep the way free that they need in order to stop, straight on. That lowers the number of
+    violations; the guarantee is for vehicles that stop at once.
 
     :param actions: ``(flocks, vehicles, 2)``, speed [m/s], not negative, and turn rate [rad/s]
     :param sensing: what every vehicle senses before it acts
     :param settings: the filters and the separations
     :param frames: cosine and sine of the vehicles' headings, ``(flocks, vehicles, 2)``, for ``heading`` and ``announce``
     :param use_numba: use numba where it is installed; the numbers are the same
+    :param stopping: what the vehicles need in order to stop; ``None``: they stop at once
     :return: ``(flocks, vehicles, 2)``; only speeds differ, none is higher
     """
     dt, margin = settings.time_step, settings.safety_margin
@@ -110,11 +141,45 @@ def filter_actions(
         budgets = np.concatenate((budgets, np.maximum(obstacles.distances - kept, 0.0)))
     rounding = ROUNDING * (margin + max(settings.neighbor_separation, settings.obstacle_separation))
     asked = actions[..., 0].ravel()
-    speeds = limit_speeds(asked, np.zeros_like(asked), observers, strides, budgets, rounding, use_numba)
+
+    def limit(floors: NDArray[np.float64]) -> NDArray[np.float64]:
+        rows = observers, strides, budgets
+        if stopping is not None:
+            rows = reserve_stopping(*rows, stopping, dt)
+        return limit_speeds(asked, floors, *rows, rounding, use_numba)
+
+    speeds = limit(np.zeros_like(asked))
     if settings.safety_filter == "announce":
-        budgets[: len(gaps)] += np.maximum(receding, 0.0) * speeds[neighbors.vehicles] * dt
-        speeds = limit_speeds(asked, speeds, observers, strides, budgets, rounding, use_numba)
+        surely = speeds if stopping is None else np.minimum(speeds, stopping.speeds.ravel())
+        budgets[: len(gaps)] += np.maximum(receding, 0.0) * surely[neighbors.vehicles] * dt
+        speeds = limit(speeds)
     return np.stack((speeds.reshape(actions.shape[:-1]), actions[..., 1]), axis=-1)
+
+
+def reserve_stopping(
+    observers: NDArray[np.int64],
+    strides: NDArray[np.float64],
+    budgets: NDArray[np.float64],
+    stopping: Stopping,
+    dt: float,
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """The rows of :func:`limit_speeds` for vehicles that need a way to stop: two bounds for each contact.
+
+    A vehicle at the speed v that is commanded u for a step and 0 from then on travels, straight on, at most the larger of
+    u dt + v lag + v^2 / (2 a) and u (dt + v / a) + v lag - v^2 / (2 a), where a bounds the acceleration. The share of that way
+    that points to a body has to fit the budget for it.
+
+    :param stopping: what the vehicles need in order to stop
+    :return: ``observers``, ``strides`` and ``budgets`` of twice as many rows; no budget is negative
+    """
+    shape = stopping.speeds.shape
+    speeds, lag, bound = (np.broadcast_to(values, shape).ravel()[observers] for values in stopping)
+    ahead = np.maximum(strides / dt, 0.0)
+    by_lag, by_bound = ahead * speeds * lag, ahead * speeds * speeds / (2 * bound)
+    first = np.maximum(budgets - by_lag - by_bound, 0.0)
+    second = np.maximum(budgets - by_lag + by_bound, 0.0)
+    steeper = strides + ahead * speeds / bound
+    return np.tile(observers, 2), np.concatenate((strides, steeper)), np.concatenate((first, second))
 
 
 def limit_speeds(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -84,7 +84,7 @@ class Contacts:
         return [self.bodies[start:end] for start, end in zip([0, *ends], ends, strict=False)]
 
     def compensate_ego_motion(self, ego_motion: NDArray[np.float64]) -> Contacts:
-        """The same bodies, where they were, in the observers' frames after a further ego-motion ``(contacts, 2)``."""
+        """The same bodies, where they were, in the observers' frames after a further ego-motion ``(contacts, 2 or 3)``."""
         positions = compensate_ego_motion(self.positions, ego_motion)
         return replace(self, positions=positions, distances=_norm(positions))
 
@@ -97,6 +97,17 @@ class Contacts:
     @property
     def _size(self) -> int:
         return self.shape[0] * self.shape[1]
+
+
+class Bodies(NamedTuple):
+    """Where the bodies of every flock are."""
+
+    positions: NDArray[np.float64]
+    """Of the vehicles, ``(flocks, vehicles, 2)`` [m]."""
+    frames: NDArray[np.float64]
+    """Cosine and sine of their headings, ``(flocks, vehicles, 2)``."""
+    obstacle_positions: NDArray[np.float64]
+    """``(flocks, obstacles, 2)`` [m]."""
 
 
 @dataclass(frozen=True)
@@ -112,14 +123,15 @@ class Sensing:
     waypoint_distances: NDArray[np.float64]
     """``(flocks, vehicles)``."""
     ego_motion: NDArray[np.float64]
-    """``(flocks, vehicles, 2)``: the vehicle's own motion since the last step, forward [m], then turn [rad]; 0 at the start."""
+    """The vehicle's own motion since the last step, forward [m], then turn [rad], ``(flocks, vehicles, 2)``; 0 at the start.
+    Where vehicles also move to the side, ``(flocks, vehicles, 3)``: the third is to the left [m], before the turn."""
     previous: Sensing | None = None
     """What was sensed ``motion_lag`` ago, in the vehicles' present frames; ``None`` without motion channels."""
 
     def compensate_ego_motion(self, ego_motion: NDArray[np.float64]) -> Sensing:
-        """The same bodies, where they were, in the vehicles' frames after a further ego-motion ``(flocks, vehicles, 2)``."""
+        """The same bodies, where they were, in the vehicles' frames after a further :attr:`ego_motion`."""
         neighbors, obstacles = (
-            contacts.compensate_ego_motion(ego_motion.reshape(-1, 2)[contacts.observers])
+            contacts.compensate_ego_motion(ego_motion.reshape(-1, ego_motion.shape[-1])[contacts.observers])
             for contacts in (self.neighbors, self.obstacles)
         )
         waypoints = compensate_ego_motion(self.waypoint_positions, ego_motion)
@@ -161,7 +173,7 @@ def sense(
         sensing = Sensing(
             neighbors=find_contacts(positions, frames, positions, link_range, exclude_self=True),
             obstacles=find_contacts(positions, frames, obstacle_positions, detection_range),
-            waypoint_positions=_to_body(offsets, frames),
+            waypoint_positions=to_body(offsets, frames),
             waypoint_distances=_norm(offsets),
             ego_motion=ego_motion,
         )
@@ -186,29 +198,35 @@ def share_detections(
     :param frames: cosine and sine of their headings, ``(flocks, vehicles, 2)``
     :param obstacle_positions: ``(flocks, obstacles, 2)`` [m]
     """
-    n_obstacles, counts = obstacle_positions.shape[1], detected.count().ravel()
+    n_obstacles = obstacle_positions.shape[1]
+    observers, bodies = np.divmod(shared_keys(neighbors, detected, n_obstacles), n_obstacles)
+    flocks = observers // positions.shape[1]
+    offsets = obstacle_positions[flocks, bodies] - positions.reshape(-1, 2)[observers]
+    return Contacts(detected.shape, observers, bodies, to_body(offsets, frames.reshape(-1, 2)[observers]), _norm(offsets))
+
+
+def shared_keys(neighbors: Contacts, detected: Contacts, n_obstacles: int) -> NDArray[np.int64]:
+    """Which obstacles each vehicle or one of its neighbors detects: ascending numbers observer * n_obstacles + obstacle."""
+    counts = detected.count().ravel()
     shared = counts[neighbors.vehicles]  # how many obstacles each neighbor detects
     first = np.repeat((np.cumsum(counts) - counts)[neighbors.vehicles] - (np.cumsum(shared) - shared), shared)
     bodies = detected.bodies[first + np.arange(len(first))]
     observers = np.concatenate((detected.observers, np.repeat(neighbors.observers, shared)))
-    observers, bodies = np.divmod(
-        np.unique(observers * n_obstacles + np.concatenate((detected.bodies, bodies))), n_obstacles
-    )
-    flocks = observers // positions.shape[1]
-    offsets = obstacle_positions[flocks, bodies] - positions.reshape(-1, 2)[observers]
-    return Contacts(detected.shape, observers, bodies, _to_body(offsets, frames.reshape(-1, 2)[observers]), _norm(offsets))
+    return np.unique(observers * n_obstacles + np.concatenate((detected.bodies, bodies)))
 
 
 def compensate_ego_motion(positions: NDArray[np.float64], ego_motion: NDArray[np.float64]) -> NDArray[np.float64]:
     """Positions in a body's frame, transformed into its frame after the body has moved.
 
     :param positions: ``(..., 2)`` [m], in the frame before the motion
-    :param ego_motion: ``(..., 2)``: forward [m], then turn [rad], as :attr:`Sensing.ego_motion`
+    :param ego_motion: ``(..., 2)``: forward [m], then turn [rad], or ``(..., 3)`` with a third, to the left [m], as
+        :attr:`Sensing.ego_motion`
     :return: ``(..., 2)`` [m], in the frame after it
     """
     forward, turn = ego_motion[..., 0], ego_motion[..., 1]
-    ahead = np.stack((positions[..., 0] - forward, positions[..., 1]), axis=-1)
-    return _to_body(ahead, np.stack((np.cos(turn), np.sin(turn)), axis=-1))
+    across = positions[..., 1] - ego_motion[..., 2] if ego_motion.shape[-1] > 2 else positions[..., 1]
+    ahead = np.stack((positions[..., 0] - forward, across), axis=-1)
+    return to_body(ahead, np.stack((np.cos(turn), np.sin(turn)), axis=-1))
 
 
 def find_contacts(
@@ -239,7 +257,7 @@ def find_contacts(
     if exclude_self:
         apart = observers % shape[1] != found
         observers, found, offsets, distances = observers[apart], found[apart], offsets[apart], distances[apart]
-    return Contacts(shape, observers, found, _to_body(offsets, frames.reshape(-1, 2)[observers]), distances)
+    return Contacts(shape, observers, found, to_body(offsets, frames.reshape(-1, 2)[observers]), distances)
 
 
 Pairs = tuple["NDArray[np.int64]", "NDArray[np.int64]", "NDArray[np.float64]", "NDArray[np.float64]"]
@@ -331,7 +349,7 @@ def _norm(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.sqrt(np.square(vectors[..., 0]) + np.square(vectors[..., 1]))
 
 
-def _to_body(offsets: NDArray[np.float64], frames: NDArray[np.float64]) -> NDArray[np.float64]:
+def to_body(offsets: NDArray[np.float64], frames: NDArray[np.float64]) -> NDArray[np.float64]:
     """Rotate world offsets into the body frame: x_ij = R(theta_i) (x_j - x_i), R the rotation into the frame."""
     (x, y), (cos, sin) = np.moveaxis(offsets, -1, 0), np.moveaxis(frames, -1, 0)
     return np.stack((cos * x + sin * y, cos * y - sin * x), axis=-1)

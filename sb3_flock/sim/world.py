@@ -10,13 +10,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from pydantic import Field, model_validator
 
-from sb3_flock.settings import ActionError, Coordinate, NotNegative, Positive, UserError
+from sb3_flock.settings import ActionError, Coordinate, NotNegative, Positive, SettingsError, UserError
 from sb3_flock.sim import dynamics
 from sb3_flock.sim.backend import compiled
-from sb3_flock.sim.dynamics import directions_of
+from sb3_flock.sim.dynamics import DYNAMICS, VehicleDynamics, directions_of, wrap_angle
+from sb3_flock.sim.randomization import FlockValues, Ranges, check_ranges, draw
 from sb3_flock.sim.safety import SafetySettings, filter_actions
-from sb3_flock.sim.sensing import Sensing, sense
+from sb3_flock.sim.sensing import Bodies, Sensing, sense, to_body
 from sb3_flock.sim.sensors import Sensors
+from sb3_flock.sim.unicycle import Unicycle  # noqa: F401 - registers the default dynamics
 
 if TYPE_CHECKING:
     from numpy.random import Generator
@@ -70,6 +72,20 @@ class WorldSettings(SafetySettings):
         return self.arena if self.obstacle_arena is None else self.obstacle_arena
 
 
+def check_randomization(ranges: Ranges, settings: WorldSettings) -> None:
+    """Check the ranges of randomized fields for a scenario.
+
+    :raises SettingsError: one line for the first that is not accepted
+    """
+    check_ranges(ranges, {"sensors": settings.sensors, "actuators": settings.actuators})
+    _, fastest = ranges.get("actuators.min_speed", (0.0, 0.0))
+    if fastest > settings.max_speed:
+        raise SettingsError(
+            f"randomization.actuators.min_speed = {list(ranges['actuators.min_speed'])}: input should be at most "
+            f"max_speed = {settings.max_speed}"
+        )
+
+
 _EPISODE = (
     "positions",
     "headings",
@@ -114,6 +130,8 @@ class World:
     :param scenario: the task, a :class:`~sb3_flock.sim.Scenario`
     :param n_flocks: number of flocks, at least 1
     :param safety: the filters and their separations, if they are not the scenario's
+    :param randomization: ranges from which fields of ``sensors`` and ``actuators`` are drawn for each flock and episode
+    :raises SettingsError: for a range that is not accepted
     """
 
     positions: NDArray[np.float64]
@@ -131,10 +149,22 @@ class World:
     steps: int
     """Steps taken since the reset, k."""
 
-    def __init__(self, scenario: WorldSettings, n_flocks: int = 1, safety: SafetySettings | None = None) -> None:
-        self.scenario, self._safety = scenario, safety
+    drawn: dict[str, NDArray[np.float64]]
+    """The randomized fields' values in the current episode by name, ``(flocks,)`` each."""
+
+    def __init__(
+        self,
+        scenario: WorldSettings,
+        n_flocks: int = 1,
+        safety: SafetySettings | None = None,
+        randomization: Ranges | None = None,
+    ) -> None:
+        self.scenario, self._safety, self.randomization = scenario, safety, dict(randomization or {})
+        check_randomization(self.randomization, scenario)
         self.n_flocks = n_flocks
-        self.sensors = Sensors(scenario)
+        self.sensors = Sensors(scenario, scenario, lambda: Bodies(self.positions, self.frames, self.obstacle_positions))
+        self.dynamics: VehicleDynamics = DYNAMICS[scenario.dynamics](scenario)
+        self.drawn = {}
         self.steps = scenario.max_cycles  # no episode is running before the first reset
         self.action_low = np.array([0.0, -scenario.max_turn_rate])
         self.action_high = np.array([scenario.max_speed, scenario.max_turn_rate])
@@ -171,6 +201,8 @@ class World:
 
         :param ego_motion: :attr:`Sensing.ego_motion`; ``None`` at the start
         """
+        if ego_motion is None and not self.dynamics.is_plain:  # as wide as after a step
+            ego_motion = np.zeros((*self.headings.shape, 3))
         return sense(self.positions, self.frames, self.obstacle_positions, self.waypoints, self.scenario, ego_motion)
 
     def reset(self, rngs: Sequence[Generator]) -> Sensing:
@@ -194,12 +226,17 @@ class World:
         walks = [self._walk(rng) for rng in rngs]
         self.obstacle_speeds = np.stack([speeds for speeds, _ in walks], axis=1)
         self.obstacle_turn_rates = np.stack([turns for _, turns in walks], axis=1) * scenario.obstacle_turn_std
+        if self.randomization:
+            self._use(draw(self.randomization, rngs))
         self.sensors.reset(rngs)
+        self.dynamics.reset(rngs)
         self.steps = 0
         return self.sense()
 
     def step(self, actions: ArrayLike) -> tuple[Sensing, NDArray[np.float64]]:
         """Move every body by one sampling period, vehicles, obstacles and waypoint together (section III-A).
+
+        The actions are commands: how the vehicles follow them is a matter of their dynamics.
 
         :param actions: ``(flocks, vehicles, 2)``, speed v [m/s] and turn rate omega [rad/s], clipped to their bounds
         :return: what the vehicles sense afterwards, and the executed actions: clipped, and filtered where the scenario says so
@@ -214,11 +251,12 @@ class World:
         check_actions(given, low.shape, "flock", "vehicle")
         executed = np.minimum(np.maximum(given, low), high)
         if safety.is_filtered:
-            executed = filter_actions(executed, self.sensors.latest or self.sense(), safety, self.frames)
+            measured, stopping = self.sensors.latest or self.sense(), self.dynamics.stopping()
+            executed = filter_actions(executed, measured, safety, self.frames, stopping=stopping)
         self.sensors.latest = None
-        self._move(executed)
+        ego_motion = self._move(executed)
         self.steps += 1
-        return self.sense(executed * self.scenario.time_step), executed
+        return self.sense(ego_motion), executed
 
     def state_dict(self) -> dict[str, Any]:
         """The current episode: everything its next steps depend on besides the actions."""
@@ -226,6 +264,8 @@ class World:
             **{name: getattr(self, name) for name in _EPISODE},
             "steps": self.steps,
             "sensors": self.sensors.state_dict(),
+            "dynamics": self.dynamics.state_dict(),
+            "drawn": self.drawn,
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -249,26 +289,64 @@ class World:
                 raise ValueError(f"{name} has the shape {state[name].shape}: {shape} is needed")
             setattr(self, name, np.array(state[name], dtype=np.float64))
         self.steps = int(state["steps"])
+        drawn = state.get("drawn", {})
+        if drawn or self.drawn:
+            self._use({name: np.array(values, dtype=np.float64) for name, values in drawn.items()})
         self.sensors.load_state_dict(state["sensors"])
+        if "dynamics" in state:
+            self.dynamics.load_state_dict(state["dynamics"])
+        else:  # of an earlier version, whose vehicles had no state of their own
+            self.dynamics.reset([np.random.default_rng(0) for _ in range(flocks)])
 
-    def _move(self, controls: NDArray[np.float64]) -> None:
-        """Vehicles by their controls ``(flocks, vehicles, 2)`` [m/s, rad/s], obstacles by drawn ones, and the waypoint."""
-        self.positions, self.headings, self.obstacle_positions, self.obstacle_headings = (
-            compiled() or dynamics
-        ).move_bodies(
-            self.positions,
-            self.frames,
-            self.headings,
-            controls,
+    def _use(self, drawn: dict[str, NDArray[np.float64]]) -> None:
+        """Let the sensors and the dynamics have drawn values."""
+
+        def of_group(group: str) -> dict[str, NDArray[np.float64]]:
+            return {name.removeprefix(group): values for name, values in drawn.items() if name.startswith(group)}
+
+        self.drawn = drawn
+        self.sensors.errors = FlockValues(self.scenario.sensors, of_group("sensors."))
+        self.dynamics.actuators = FlockValues(self.scenario.actuators, of_group("actuators."))
+
+    def _move(self, controls: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Vehicles by their controls ``(flocks, vehicles, 2)`` [m/s, rad/s], obstacles by drawn ones, and the waypoint.
+
+        :return: the vehicles' own motion, :attr:`Sensing.ego_motion`
+        """
+        is_plain, dt = self.dynamics.is_plain, self.scenario.time_step
+        ego_motion = controls * dt if is_plain else self._move_vehicles(controls)
+        vehicles = self.positions, self.frames, self.headings, controls
+        if not is_plain:  # the vehicles have moved
+            positions, frames, headings, controls = vehicles
+            vehicles = positions[:, :0], frames[:, :0], headings[:, :0], controls[:, :0]
+        positions, headings, self.obstacle_positions, self.obstacle_headings = (compiled() or dynamics).move_bodies(
+            *vehicles,
             self.obstacle_positions,
             directions_of(self.obstacle_headings),
             self.obstacle_headings,
             self.obstacle_speeds[self.steps],
             self.obstacle_turn_rates[self.steps],
-            self.scenario.time_step,
+            dt,
             self.scenario.obstacle_half_side,
         )
+        if is_plain:
+            self.positions, self.headings = positions, headings
         self.waypoints = waypoints_ahead(self.scenario, self.waypoints, self.steps, self._one_step)[:, 0]
+        return ego_motion
+
+    def _move_vehicles(self, controls: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Vehicles by their dynamics; their own motion forward, turn and to the left, ``(flocks, vehicles, 3)``."""
+        before, frames, earlier = self.positions, self.frames, self.headings
+        positions, headings = self.dynamics.step(before, earlier, controls, self.scenario.time_step)
+        for name, now, then in (("positions", positions, before), ("headings", headings, earlier)):
+            if np.shape(now) != then.shape or not np.isfinite(now).all():
+                raise ValueError(
+                    f"dynamics = {self.scenario.dynamics}: its step returns {name} of shape {np.shape(now)}: finite ones of "
+                    f"shape {then.shape} are needed"
+                )
+        self.positions, self.headings = positions, wrap_angle(headings)
+        forward, left = np.moveaxis(to_body(positions - before, frames), -1, 0)
+        return np.stack((forward, wrap_angle(headings - earlier), left), axis=-1)
 
     def _start(self, rng: Generator) -> tuple[NDArray[np.float64], ...]:
         scenario = self.scenario

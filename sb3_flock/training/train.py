@@ -195,7 +195,13 @@ def make_training_env(config: TrainingConfig) -> ParameterSharingVecEnv:
 def _make_flocks(config: TrainingConfig, scenario: Scenario, n_flocks: int) -> parallel_env:
     train_env, safety = config.train_env, config.training_safety(scenario)
     if train_env.expert is None:
-        return parallel_env(scenario, n_flocks=n_flocks, action_repeat=train_env.action_repeat, safety=safety)
+        return parallel_env(
+            scenario,
+            n_flocks=n_flocks,
+            action_repeat=train_env.action_repeat,
+            safety=safety,
+            randomization=train_env.randomization,
+        )
     make_expert = EXPERTS[train_env.expert]
     return ExpertEnv(
         scenario,
@@ -206,6 +212,7 @@ def _make_flocks(config: TrainingConfig, scenario: Scenario, n_flocks: int) -> p
         n_flocks=n_flocks,
         action_repeat=train_env.action_repeat,
         safety=safety,
+        randomization=train_env.randomization,
     )
 
 
@@ -314,11 +321,13 @@ def _summary(config: TrainingConfig, model: OffPolicyAlgorithm, folder: Path) ->
     compiled = ""
     if isinstance(model, FlockTD3) and can_compile(model):
         compiled = f", of the compiled update {model.update_threads},"
+    limits = ", ".join(config.scenario.guarantee_limits)
     return (
         f"{config.algo} for {config.scenario.bodies}; training env: {config.n_flocks} flocks of "
         f"{' and of '.join(str(scenario.n_vehicles) for scenario in scenarios)} vehicles, {scenarios[0].n_obstacles} obstacles "
         f"each; device {model.device}, "
         f"torch threads {th.get_num_threads()}{compiled} on {cores()} cores; {folder}"
+        + (f"; the safety filter guarantees no separation with {limits}" if limits else "")
     )
 
 

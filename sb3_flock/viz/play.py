@@ -221,7 +221,13 @@ class Game:
         state = {**self.world.state_dict(), **values}
         n_vehicles, n_obstacles = (state[name].shape[1] for name in ("positions", "obstacle_positions"))
         self.world = World(self.scenario.replace(n_vehicles=n_vehicles, n_obstacles=n_obstacles))
-        self.world.load_state_dict(state)
+        self.world.dynamics.reset([self.rng])
+        starting = self.world.dynamics.state_dict()  # a vehicle that joins moves as at the start of an episode
+        for name, present in state["dynamics"].items():
+            if name != "rngs":
+                joining = starting[name][:, present.shape[1] :]
+                starting[name] = np.concatenate((present[:, :n_vehicles], joining), axis=1)
+        self.world.load_state_dict({**state, "dynamics": {**starting, "rngs": state["dynamics"]["rngs"]}})
         self.world.sensors.forget()
         self.sensing = self.world.sense()
         self._reset_controller()

@@ -5,7 +5,7 @@ import pytest
 
 from sb3_flock._renamed import RenamedWarning
 from sb3_flock.config.training import TaskConfig, TrainEnvConfig, TrainingConfig
-from sb3_flock.serialization.yaml_io import load_config
+from sb3_flock.serialization.yaml_io import load_config, parse_overrides, to_yaml
 from sb3_flock.settings import SettingsError
 from sb3_flock.sim import Scenario
 
@@ -187,3 +187,21 @@ def test_the_filter_of_a_training_env_keeps_the_tasks_separations():
     assert (scenario.safety_filter, safety.safety_filter) == ("off", "announce")
     same = {"neighbor_separation", "obstacle_separation", "safety_filter"}
     assert all(getattr(safety, name) == getattr(scenario, name) for name in set(type(safety).model_fields) - same)
+
+
+def test_randomized_fields_are_read_checked_and_written(tmp_path):
+    overrides = parse_overrides(["randomization={actuators.speed_lag: [0, 0.3], sensors.dropout: [0.1, 0.2]}"])
+    config = load_config(TrainingConfig, overrides=overrides)
+    assert config.train_env.randomization == {"actuators.speed_lag": (0.0, 0.3), "sensors.dropout": (0.1, 0.2)}
+    assert config.scenario == TrainingConfig().scenario  # an evaluation has the task's own values
+    (tmp_path / "config.yaml").write_text(to_yaml(config))
+    assert load_config(TrainingConfig, tmp_path / "config.yaml") == config
+    assert hash(config.train_env) != hash(TrainingConfig().train_env)
+    with pytest.raises(
+        SettingsError, match=r"^train_env.randomization.sensors.dropout = \[0.1, 2.0\]: input should be less"
+    ):
+        load_config(TrainingConfig, overrides={"randomization": {"sensors.dropout": [0.1, 2]}})
+    with pytest.raises(
+        SettingsError, match=r"^randomization.actuators.min_speed = .*: input should be at most max_speed = 0.1"
+    ):
+        load_config(TrainingConfig, overrides={"max_speed": 0.1, "randomization": {"actuators.min_speed": [0, 0.12]}})

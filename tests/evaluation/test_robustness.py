@@ -5,7 +5,16 @@ from rich.console import Console
 
 from sb3_flock import Scenario, load_policy
 from sb3_flock.cli import main
-from sb3_flock.evaluation.robustness import errors_table, evaluate_with_errors, sensor_errors
+from sb3_flock.controllers import make_controller
+from sb3_flock.evaluation.robustness import (
+    conditions,
+    errors_table,
+    evaluate_robustness,
+    evaluate_with_errors,
+    sensor_errors,
+)
+from sb3_flock.sim.actuators import Actuators
+from sb3_flock.sim.sensors import SensorErrors
 
 
 @pytest.fixture(scope="module")
@@ -37,6 +46,56 @@ def test_the_table_fits_80_columns(rows):
 
 
 def test_the_command(capsys):
-    words = ["evaluate", "--controller", "go-to-waypoint", "--sensors", "--episodes", "2", "--set", "max_cycles=4"]
+    words = ["evaluate", "--controller", "go-to-waypoint", "--robustness", "--episodes", "2", "--set", "max_cycles=4"]
+    assert main([*words, "--set", "safety_filter=announce"]) == 0
+    shown, error = capsys.readouterr()
+    for row in ("delay of 0.8 s", "speed lag of 0.3 s", "acceleration of 0.3 m/s^2", "slip of 5%", "field conditions"):
+        assert row in shown
+    assert error == ""  # rows without a guarantee are what was asked for
+
+
+def test_the_flags_old_name_works_with_one_line(capsys):
+    words = ["evaluate", "--controller", "go-to-waypoint", "--sensors", "--episodes", "1", "--set", "max_cycles=2"]
     assert main(words) == 0
-    assert "delay of 0.8 s" in capsys.readouterr().out
+    shown, error = capsys.readouterr()
+    assert "field conditions" in shown
+    assert error == "sb3-flock: warning: --sensors is now --robustness; the old name works for one release\n"
+
+
+def test_each_condition_changes_one_thing_and_the_field_several():
+    rows = conditions(Scenario(sensors={"dropout": 0.5}, actuators={"slip": 0.5}))
+    assert next(iter(rows)) == "none"
+    for name, row in rows.items():
+        changed = [
+            f"{group}.{field}"
+            for group, exact in (("sensors", SensorErrors()), ("actuators", Actuators()))
+            for field in type(exact).model_fields
+            if getattr(getattr(row, group), field) != getattr(exact, field)
+        ]
+        expected = {"none": 0, "field conditions": 5}.get(name, 1)
+        assert len(changed) == expected, (name, changed)
+    field = rows["field conditions"]
+    assert field.sensors == SensorErrors(position_noise=0.01, dropout=0.1, delay=0.1)
+    assert field.actuators == Actuators(speed_lag=0.1, slip=0.05)
+    assert [rows[f"acceleration of {value} m/s^2"].actuators.max_acceleration for value in ("1", "0.3")] == [1.0, 0.3]
+    assert [rows[f"speed lag of {value} s"].actuators.speed_lag for value in ("0.1", "0.3")] == [0.1, 0.3]
+
+
+def test_conditions_follow_the_scenario():
+    rows = conditions(Scenario(link_range=6.0, neighbor_separation=3.0, time_step=0.5, max_speed=1.5))
+    assert rows["speed lag of 1.5 s"].actuators.speed_lag == 1.5
+    assert rows["acceleration of 2 m/s^2"].actuators.max_acceleration == 2.0
+    assert rows["field conditions"].sensors.position_noise == 0.4
+
+
+def test_every_condition_has_an_effect():
+    """On a controller that uses what it measures of others and of itself; the first row is the scenario itself."""
+    rows = evaluate_robustness(
+        make_controller("orca"), Scenario(n_vehicles=6, n_obstacles=25, arena=0.7, obstacle_arena=0.5, max_cycles=40), 2
+    )
+    exact = rows.pop("none")
+    for name, row in rows.items():
+        assert row["return"] != exact["return"], name
+    console = Console(width=80, record=True, file=io.StringIO())
+    console.print(errors_table({"none": exact, **rows}))
+    assert not any("…" in line for line in console.export_text().splitlines())

@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sb3_flock.sim import Scenario, World, dynamics, episode_rng, mix_rewards, reward, reward_terms, sensing
+from sb3_flock.sim import Scenario, World, dynamics, episode_rng, mix_rewards, reward, reward_terms, sensing, unicycle
+from sb3_flock.sim.randomization import UNBOUNDED
 
 kernels = pytest.importorskip("sb3_flock.sim.kernels")
 
@@ -45,6 +46,21 @@ def test_bodies_move_as_in_numpy(seed, flocks, vehicles, obstacles):
     )
     for fast, plain in zip(kernels.move_bodies(*arguments), dynamics.move_bodies(*arguments), strict=True):
         np.testing.assert_array_equal(fast, plain)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**31), st.integers(1, 3), st.integers(1, 6))
+def test_unicycles_with_actuators_move_as_in_numpy(seed, flocks, vehicles):
+    """Up to the rounding of the exponential; each actuator is switched off in some flocks."""
+    rng = np.random.default_rng(seed)
+    off = np.array([0.0, 0.0, UNBOUNDED, UNBOUNDED, 0.0, 0.0, 0.0])[:, None]
+    values = np.where(rng.random((7, flocks)) < 0.4, off, rng.uniform(0.01, [[1], [1], [2], [20], [0.1], [1], [0.1]]))
+    headings = rng.uniform(-np.pi, np.pi, (flocks, vehicles))
+    arrays = rng.uniform(-1, 1, (4, flocks, vehicles, 2))
+    noise = rng.normal(size=(flocks, vehicles, 3))
+    arguments = arrays[0], dynamics.directions_of(headings), headings, arrays[1], arrays[2], noise, values, 0.1
+    for fast, plain in zip(kernels.step_unicycles(*arguments), unicycle.step_unicycles(*arguments), strict=True):
+        np.testing.assert_allclose(fast, plain, atol=1e-13)
 
 
 def test_sensing_and_rewards_are_those_of_numpy(monkeypatch):

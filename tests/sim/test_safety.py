@@ -5,11 +5,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sb3_flock.controllers import make_controller
 from sb3_flock.envs import flocking_v0
+from sb3_flock.evaluation import evaluate
 from sb3_flock.serialization.yaml_io import load_config, parse_overrides
 from sb3_flock.settings import SettingsError
 from sb3_flock.sim import Scenario, World, episode_rng, safety
-from sb3_flock.sim.safety import filter_actions
+from sb3_flock.sim.actuators import follow
+from sb3_flock.sim.dynamics import Stopping
+from sb3_flock.sim.randomization import UNBOUNDED
+from sb3_flock.sim.safety import filter_actions, reserve_stopping
 from sb3_flock.sim.sensing import nearest
 from tests.helpers import assert_copy_continues_alike, place
 
@@ -254,6 +259,15 @@ def provoke(vehicle_steps, seed):
     return simulated
 
 
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**31), st.integers(2, 40), st.sampled_from(FILTERS), st.sampled_from(DRIVERS), st.booleans())
+def test_a_view_of_half_the_circle_keeps_the_guarantee(seed, n_vehicles, safety_filter, driver, is_packed):
+    """A vehicle never moves backwards, and a neighbor that sees it from behind knows no more of it than it may use."""
+    scenario = random_task(np.random.default_rng(seed), n_vehicles, safety_filter).replace(sensors={"field_of_view": np.pi})
+    assert scenario.guarantee_limits == ()
+    simulate(scenario, driver, 2, seed, is_packed)
+
+
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**31), st.integers(2, 40), st.sampled_from(FILTERS), st.sampled_from(DRIVERS), st.booleans())
 def test_no_pair_ends_a_step_nearer_than_its_separation(seed, n_vehicles, safety_filter, driver, is_packed):
@@ -313,6 +327,84 @@ def test_only_an_obstacle_that_comes_near_of_its_own_violates_a_separation(drive
     assert begun > 0
 
 
+# Vehicles that do not stop at once.
+
+
+def test_what_ends_the_guarantee_is_named():
+    assert Scenario().guarantee_limits == ()
+    assert Scenario(actuators={"slip": 0.1}).guarantee_limits == ()  # nothing was guaranteed
+    exact = filtered("announce", actuators={"turn_lag": 0.2, "max_turn_acceleration": 3.0})
+    assert exact.guarantee_limits == ()
+    other = filtered("announce", actuators={"speed_lag": 0.1, "min_speed": 0.05}, sensors={"position_noise": 0.01})
+    assert other.guarantee_limits == (
+        "actuators.speed_lag = 0.1",
+        "actuators.min_speed = 0.05",
+        "sensors.position_noise = 0.01",
+    )
+    assert filtered("voronoi", sensors={"field_of_view": 3.0}).guarantee_limits == ("sensors.field_of_view = 3",)
+    assert filtered("voronoi", sensors={"odometry_noise": 0.1}).guarantee_limits == ()
+    assert filtered("motion", sensors={"odometry_noise": 0.1}).guarantee_limits == ("sensors.odometry_noise = 0.1",)
+    assert Scenario(obstacle_filter=True, actuators={"disturbance": 0.01}).guarantee_limits == (
+        "actuators.disturbance = 0.01",
+    )
+
+
+def test_an_evaluation_warns_in_one_line_of_a_filter_without_its_guarantee():
+    controller, scenario = make_controller("go-to-waypoint"), filtered("voronoi", max_cycles=2)
+    evaluate(controller, scenario, 1)
+    with pytest.warns(UserWarning, match=r"^the safety filter guarantees no separation with actuators.slip = 0.1$"):
+        evaluate(controller, scenario.replace(actuators={"slip": 0.1}), 1)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.floats(0, 0.5), st.floats(0.05, 3) | st.just(None), st.floats(0.02, 0.3), st.floats(0.01, 0.5))
+def test_a_vehicle_that_heads_for_a_standing_obstacle_stops_in_time_whatever_it_needs_for_it(lag, bound, dt, start):
+    """Straight on, the way that is kept free is enough: up to rounding the vehicle ends at the separation."""
+    actuators = {"speed_lag": lag, "max_acceleration": bound}
+    ranges = {"obstacle_separation": 0.15, "detection_range": 2.0, "max_speed": 0.3, "obstacle_max_speed": 0.0}
+    scenario = Scenario(obstacle_filter=True, time_step=dt, actuators=actuators, max_cycles=1000, **ranges)
+    world = place(scenario, [(-start - 0.15, 0.0)], [0.0], obstacles=[(0.0, 0.0)])
+    for _ in range(int(start / (0.3 * dt)) + 200):
+        sensing, _ = world.step([[(0.3, 0.0)]])
+        assert sensing.obstacles.distances[0] >= 0.15
+
+
+def test_without_the_reserve_such_a_vehicle_violates_the_separation(monkeypatch):
+    scenario = Scenario(obstacle_filter=True, obstacle_max_speed=0.0, actuators={"max_acceleration": 0.1})
+    world = place(scenario, [(-0.5, 0.0)], [0.0], obstacles=[(0.0, 0.0)])
+    monkeypatch.setattr(type(world.dynamics), "stopping", lambda self: None)
+    nearest_distance = min(np.hypot(*world.step([[(0.15, 0.0)]])[0].obstacles.positions.T).min(initial=1) for _ in range(80))
+    assert nearest_distance < 0.1
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    st.floats(0, 1),
+    st.floats(0, 1),
+    st.floats(0, 1),
+    st.floats(0.01, 10) | st.just(UNBOUNDED),
+    st.floats(0.01, 1),
+    st.floats(0, 0.5),
+)
+def test_the_admitted_command_is_followed_by_a_stop_within_the_budget(asked, speed, lag, bound, dt, budget):
+    """The way of a step with the highest command that the rows admit, and of a full stop after it, fits the budget."""
+    stopping = Stopping(*(np.full((1, 1), value) for value in (speed, lag, bound)))
+    contact = np.zeros(1, np.int64), np.array([dt]), np.array([budget])
+    observers, strides, budgets = reserve_stopping(*contact, stopping, dt)
+    command = min(asked, (budgets / strides).min())
+    after, way = follow(*map(np.float64, (speed, command, lag, bound)), dt)
+    reach = speed
+    for _ in range(400):  # the stop, from each of the two speeds
+        after, stride = follow(after, np.float64(0.0), np.float64(lag), np.float64(bound), max(dt, 0.3))
+        way += stride
+    needed = 0.0
+    for _ in range(400):
+        reach, stride = follow(np.float64(reach), np.float64(0.0), np.float64(lag), np.float64(bound), max(dt, 0.3))
+        needed += stride
+    assert way <= max(budget, needed) + 1e-9  # no command helps where already the stop takes more than there is
+    assert list(observers) == [0, 0]
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize("use_numba", [True, False])
@@ -331,3 +423,36 @@ def test_a_world_without_numba_steps_alike(monkeypatch):
     fast = states()
     monkeypatch.setattr(safety, "compiled", lambda module: None)
     np.testing.assert_array_equal(fast, states())
+
+
+def test_the_reserve_is_the_same_without_numba(monkeypatch):
+    scenario = filtered(
+        "announce", n_vehicles=20, obstacle_filter=True, actuators={"speed_lag": 0.1, "max_acceleration": 1.0}
+    )
+
+    def states():
+        world = World(scenario, 3)
+        world.reset([episode_rng(0, episode) for episode in range(3)])
+        return [world.step(rush(world, None))[1] for _ in range(60)]
+
+    fast = states()
+    monkeypatch.setattr(safety, "compiled", lambda module: None)
+    np.testing.assert_array_equal(fast, states())
+
+
+def test_a_reserve_lowers_speeds_and_never_below_zero():
+    """Beside the same filter without it, from the same state."""
+    scenario = filtered("announce", n_vehicles=20, actuators={"speed_lag": 0.2}, obstacle_filter=True)
+    world = World(scenario, 3)
+    world.reset([episode_rng(0, episode) for episode in range(3)])
+    lowered = 0
+    for _ in range(60):
+        actions = np.clip(rush(world, None), world.action_low, world.action_high)
+        measured, stopping = world.sense(), world.dynamics.stopping()
+        kept = filter_actions(actions, measured, scenario, world.frames, stopping=stopping)
+        plain = filter_actions(actions, measured, scenario, world.frames)
+        assert (kept[..., 0] >= 0).all()
+        assert (kept[..., 0] <= plain[..., 0] + 1e-12).all()
+        lowered += (kept[..., 0] < plain[..., 0] - 1e-6).sum()
+        world.step(actions)
+    assert lowered > 100

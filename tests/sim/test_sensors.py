@@ -67,7 +67,9 @@ def test_a_measurement_is_used_after_the_delay():
 
 
 def test_a_flocks_sensor_errors_do_not_depend_on_the_batch():
-    scenario = with_errors(position_noise=0.01, dropout=0.2, delay=0.1)
+    scenario = with_errors(
+        position_noise=0.01, dropout=0.2, delay=0.1, field_of_view=4.0, occlusion=0.03, odometry_noise=0.1
+    ).replace(motion_lag=0.2)
     many, few = (
         rollout(make_controller("go-to-waypoint"), scenario.replace(max_cycles=20), 6, 0, batch) for batch in (6, 2)
     )
@@ -85,8 +87,10 @@ def test_reward_and_metrics_are_of_the_truth():
 
 
 def test_an_env_shows_what_is_measured_and_continues_from_its_state():
-    env = flocking_v0.parallel_env(with_errors(position_noise=0.02, dropout=0.2, delay=0.2))
-    exact = flocking_v0.parallel_env(CROWD)
+    errors = {"position_noise": 0.02, "dropout": 0.2, "delay": 0.2}
+    errors |= {"field_of_view": 5.0, "occlusion": 0.02, "odometry_noise": 0.1}
+    env = flocking_v0.parallel_env(with_errors(**errors).replace(motion_lag=0.2))
+    exact = flocking_v0.parallel_env(CROWD.replace(motion_lag=0.2))
     observations, _ = env.reset(seed=3)
     truth, _ = exact.reset(seed=3)
     assert any(np.abs(observations[agent] - truth[agent]).max() > 0.1 for agent in env.agents)
@@ -103,7 +107,48 @@ def test_sense_is_always_exact():
     np.testing.assert_array_equal(world.sense().waypoint_positions, truth.waypoint_positions)
 
 
-@pytest.mark.parametrize(("name", "value"), [("position_noise", -1.0), ("dropout", 1.1), ("delay", float("nan"))])
+def test_odometry_has_relative_errors_and_the_motion_channels_use_them():
+    scenario = CROWD.replace(motion_lag=0.1, sensors=SensorErrors(odometry_noise=0.2))
+    world, truth = begin(scenario, n_flocks=300)
+    world.sensors.measure(truth)
+    truth, _ = world.step(np.full((300, 12, 2), (0.1, 1.0)))
+    measured = world.sensors.measure(truth)
+    factors = measured.ego_motion / truth.ego_motion
+    np.testing.assert_allclose(factors.std((0, 1)), 0.2, rtol=0.05)
+    np.testing.assert_allclose(factors.mean((0, 1)), 1.0, atol=0.01)
+    np.testing.assert_array_equal(measured.waypoint_positions, truth.waypoint_positions)
+    before = begin(scenario, n_flocks=300)[1]
+    expected = before.compensate_ego_motion(measured.ego_motion)
+    np.testing.assert_array_equal(measured.previous.waypoint_positions, expected.waypoint_positions)
+
+
+def test_a_drifting_vehicle_measures_both_parts_of_its_way_with_one_error():
+    actuators = {"disturbance": 0.05}
+    world, truth = begin(CROWD.replace(sensors=SensorErrors(odometry_noise=0.2), actuators=actuators))
+    truth, _ = world.step(np.full((1, 12, 2), (0.1, 1.0)))
+    factors = world.sensors.measure(truth).ego_motion / truth.ego_motion
+    np.testing.assert_allclose(factors[..., 0], factors[..., 2])
+    assert (np.abs(factors[..., 0] - factors[..., 1]) > 1e-6).all()
+
+
+def test_a_standing_vehicle_measures_that_it_stands():
+    world, _ = begin(with_errors(odometry_noise=0.5))
+    truth, _ = world.step(np.zeros((1, 12, 2)))
+    assert not world.sensors.measure(truth).ego_motion.any()
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("position_noise", -1.0),
+        ("dropout", 1.1),
+        ("delay", float("nan")),
+        ("field_of_view", 0.0),
+        ("field_of_view", 6.3),
+        ("occlusion", -0.1),
+        ("odometry_noise", float("inf")),
+    ],
+)
 def test_mistakes_are_one_line(name, value):
     with pytest.raises(SettingsError, match=f"{name} = "):
         SensorErrors(**{name: value})

@@ -35,6 +35,13 @@ class PowerFails(BaseCallback):
 
 LONG = {"scenario.max_cycles": 40, "save_freq": 120, "eval_freq": 180, "total_timesteps": 600, "buffer_size": 330}
 
+RANGES = {
+    "actuators.speed_lag": (0.0, 0.3),
+    "actuators.slip": (0.0, 0.1),
+    "sensors.delay": (0.0, 0.3),
+    "sensors.dropout": (0, 1),
+}
+
 
 @pytest.mark.parametrize(
     ("algo", "changes"),
@@ -48,6 +55,7 @@ LONG = {"scenario.max_cycles": 40, "save_freq": 120, "eval_freq": 180, "total_ti
         ("ddpg", {"expert": "orca", "bc_coef": 1.0, "expert_fraction": 0.3}),
         ("ddpg", {"expert": "mpc", "bc_coef": 1.0, "expert_fraction": 0.3}),
         ("ddpg", {"expert": "olfati-saber", "expert_fraction": 0.9, "train_env.flock_sizes": [1, 2]}),
+        ("ddpg", {"expert": "orca", "bc_coef": 1.0, "motion_lag": 0.4, "actuators.turn_lag": 0.1, "randomization": RANGES}),
     ],
 )
 def test_a_resumed_run_equals_an_uninterrupted_one_to_the_last_bit(tmp_path, algo, changes):

@@ -1,5 +1,6 @@
 """Smoke trainings of every algorithm, and what a run folder holds."""
 
+import io
 import json
 import signal
 import zipfile
@@ -7,6 +8,7 @@ import zipfile
 import numpy as np
 import pytest
 import torch as th
+from rich.console import Console
 
 from sb3_flock import evaluate, load_policy, train
 from sb3_flock.config.training import TrainingConfig
@@ -242,3 +244,13 @@ def test_in_training_the_filter_keeps_the_tasks_separations_and_the_reward_count
     env.close()
     assert 0.1 <= min(nearest) < 0.115
     assert any(penalized)
+
+
+@pytest.mark.parametrize(
+    ("slip", "limits"), [(0.05, "; the safety filter guarantees no separation with actuators.slip = 0.05"), (0.0, "")]
+)
+def test_the_first_line_names_what_ends_the_guarantee_of_the_filter(tmp_path, slip, limits):
+    console = Console(file=io.StringIO(), width=1000)
+    result = train(tiny(tmp_path, total_timesteps=60, eval_freq=0, n_test_episodes=1, **{"actuators.slip": slip}), console)
+    first = console.file.getvalue().splitlines()[0]
+    assert first.endswith(f"{result.folder}{limits}")

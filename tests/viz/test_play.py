@@ -81,6 +81,22 @@ def test_vehicles_come_and_go_and_the_others_stay(game):
     assert game.world.scenario.n_vehicles == 1  # one stays
 
 
+def test_vehicles_with_actuators_keep_their_speeds_while_others_come_and_go():
+    scenario = Scenario(n_vehicles=3, actuators={"speed_lag": 0.5, "slip": 0.05})
+    game = Game(make_controller("go-to-waypoint"), scenario, seed=1)
+    for _ in range(10):
+        game.step()
+    rates = game.world.dynamics.rates
+    press(game, pygame.K_PLUS)
+    np.testing.assert_array_equal(game.world.dynamics.rates[:, :3], rates)
+    np.testing.assert_array_equal(game.world.dynamics.rates[:, 3], 0.0)
+    for _ in range(2):
+        press(game, pygame.K_MINUS)
+    np.testing.assert_array_equal(game.world.dynamics.rates, rates[:, :2])
+    game.step()
+    assert (game.world.dynamics.rates != rates[:, :2]).any()
+
+
 def test_pause_step_and_new_episode(game):
     press(game, pygame.K_SPACE)
     assert game.is_paused
