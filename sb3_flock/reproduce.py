@@ -20,7 +20,7 @@ from sb3_flock.evaluation import robustness
 from sb3_flock.evaluation.metrics import METRICS, EpisodeMetric, Metric, columns
 from sb3_flock.evaluation.model_cards import over_seeds, read_card
 from sb3_flock.evaluation.report import PAPER
-from sb3_flock.evaluation.robustness import evaluate_with_errors
+from sb3_flock.evaluation.robustness import evaluate_robustness
 from sb3_flock.evaluation.rollout import evaluate
 from sb3_flock.evaluation.tasks import CROSSING, EXPERIMENTS, TASKS, with_bodies_of
 from sb3_flock.rl.callbacks import NeighborInclusiveReward
@@ -129,7 +129,7 @@ def reproduce(out: str | Path, quick: bool = False, console: Console | None = No
         "figures": lambda: _episode_figures(folder, policies[SHOWN]),
         "training curves": lambda: _training_curve(folder, policies),
         "one policy with 1 to 200 vehicles": lambda: _flock_sizes(folder, policies[ANY_SIZE], size.flock_size_episodes),
-        "sensor errors": lambda: _sensors(policies[SHOWN], size.episodes // 4 or 1),
+        "sensor errors and other dynamics": lambda: _robustness(policies[SHOWN], size.episodes // 4 or 1),
         "time of training against the number of vehicles": lambda: _training_time(folder, size.timed_steps),
     }
     parts = [_head(size)]
@@ -295,14 +295,14 @@ def _flock_sizes(folder: Path, policy: LoadedPolicy, episodes: int) -> str:
     )
 
 
-def _sensors(policy: LoadedPolicy, episodes: int) -> str:
-    rows = evaluate_with_errors(policy, policy.scenario, episodes)
+def _robustness(policy: LoadedPolicy, episodes: int) -> str:
+    rows = evaluate_robustness(policy, policy.scenario, episodes)
     headings = list(columns().values())
     lines = [
-        "## Sensor errors\n",
-        f"`{SHOWN}`, trained without errors, filter `{policy.scenario.safety_filter}`; {episodes} episodes a row "
-        f"(`sb3-flock evaluate {SHOWN} --sensors`):\n",
-        "| sensor errors | " + " | ".join(headings) + " |",
+        "## Sensor errors and other dynamics\n",
+        f"`{SHOWN}`, trained without errors and with the paper's dynamics, filter `{policy.scenario.safety_filter}`; {episodes} episodes a row "
+        f"(`sb3-flock evaluate {SHOWN} --robustness`):\n",
+        "| conditions | " + " | ".join(headings) + " |",
         "|---" * (len(headings) + 1) + "|",
         *(f"| {name} | " + " | ".join(robustness.cells(row)) + " |" for name, row in rows.items()),
     ]

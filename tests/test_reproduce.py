@@ -104,7 +104,7 @@ def test_each_shipped_policy_has_the_median_and_the_range_of_its_trainings_in_ev
 
 def test_free_and_success_have_their_intervals(tables):
     for title, rows in tables.items():
-        if title in {"Sensor errors", "Time of training"}:
+        if title in {"Sensor errors and other dynamics", "Time of training"}:
             continue
         for label, _, *cells in rows:
             assert len(cells) == len(COLUMNS)
@@ -127,7 +127,7 @@ def test_with_the_filter_no_separation_to_neighbors_is_violated(tables):
 def test_flock_sizes_and_sensor_errors_have_a_row_each(tables):
     sizes = [row[:2] for row in tables["One policy, any number of vehicles"]]
     assert sizes == [[f"{n} vehicle{'s' * (n > 1)}", f"`{name}`"] for n in FLOCK_SIZES for name in FILTERS]
-    errors = [row[0] for row in tables["Sensor errors"]]
+    errors = [row[0] for row in tables["Sensor errors and other dynamics"]]
     assert sum(name.startswith(("noise of ", "delay of ")) for name in errors) == 8
 
 

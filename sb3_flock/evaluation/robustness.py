@@ -61,24 +61,14 @@ def conditions(scenario: Scenario) -> dict[str, Scenario]:
     }
 
 
-def evaluate_with_errors(policy: Any, scenario: Scenario, episodes: int, seed: int = 0) -> dict[str, dict[str, Metric]]:
-    """The metrics under each of :func:`sensor_errors`; the parameters are those of :func:`~sb3_flock.evaluation.evaluate`."""
-    errors = {name: scenario.replace(sensors=sensors) for name, sensors in sensor_errors(scenario).items()}
-    return _evaluate_each(policy, errors, episodes, seed)
-
-
 def evaluate_robustness(policy: Any, scenario: Scenario, episodes: int, seed: int = 0) -> dict[str, dict[str, Metric]]:
     """The metrics under each of :func:`conditions`; the parameters are those of :func:`~sb3_flock.evaluation.evaluate`.
 
     A safety filter guarantees nothing in these rows, but for the first.
     """
-    return _evaluate_each(policy, conditions(scenario), episodes, seed)
-
-
-def _evaluate_each(policy: Any, scenarios: dict[str, Scenario], episodes: int, seed: int) -> dict[str, dict[str, Metric]]:
     return {
-        name: summarize(rollout(as_controller(policy, scenario), scenario, episodes, seed))
-        for name, scenario in scenarios.items()
+        name: summarize(rollout(as_controller(policy, changed), changed, episodes, seed))
+        for name, changed in conditions(scenario).items()
     }
 
 

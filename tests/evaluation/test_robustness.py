@@ -10,7 +10,6 @@ from sb3_flock.evaluation.robustness import (
     conditions,
     errors_table,
     evaluate_robustness,
-    evaluate_with_errors,
     sensor_errors,
 )
 from sb3_flock.sim.actuators import Actuators
@@ -22,7 +21,7 @@ def rows():
     """Without the safety filter, so that there are violations."""
     policy = load_policy("ddpg")
     unfiltered = policy.scenario.replace(n_vehicles=3, n_obstacles=1, max_cycles=100, safety_filter="off")
-    return evaluate_with_errors(policy, unfiltered, episodes=20)
+    return evaluate_robustness(policy, unfiltered, episodes=20)
 
 
 def test_a_policy_tracks_worse_with_much_noise_than_with_none(rows):
