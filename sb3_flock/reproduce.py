@@ -300,7 +300,7 @@ def _robustness(policy: LoadedPolicy, episodes: int) -> str:
     headings = list(columns().values())
     lines = [
         "## Sensor errors and other dynamics\n",
-        f"`{SHOWN}`, trained without errors and with the paper's dynamics, filter `{policy.scenario.safety_filter}`; {episodes} episodes a row "
+        f"`{SHOWN}`, trained with none of these, filter `{policy.scenario.safety_filter}`; {episodes} episodes a row "
         f"(`sb3-flock evaluate {SHOWN} --robustness`):\n",
         "| conditions | " + " | ".join(headings) + " |",
         "|---" * (len(headings) + 1) + "|",

@@ -47,9 +47,7 @@ def test_the_graph_acts_as_predict_does(exported, policy):
 def test_bodies_out_of_range_are_ignored(exported):
     near, waypoint = np.array([[0.08, 0.05]]), np.array([0.2, 0.1])
     alone = act(exported.path, near, np.zeros((0, 2)), waypoint)
-    crowd = act(
-        exported.path, np.array([[0.08, 0.05], [0.2, 0.0], [0.0, 0.151]]), np.array([[0.0, 0.41]]), waypoint
-    )  # detections are shared
+    crowd = act(exported.path, np.array([[0.08, 0.05], [0.2, 0.0], [0.0, 0.151]]), np.array([[0.0, 0.41]]), waypoint)
     np.testing.assert_array_equal(alone, crowd)
     assert np.abs(act(exported.path, near[:0], np.zeros((0, 2)), waypoint) - alone).max() > 1e-3
 
