@@ -48,7 +48,6 @@ class Rows:
 
 
 ROWS = (
-    Rows("paper-plain", "the paper's method as published"),
     Rows("ddpg", "reinforcement learning alone"),
     Rows("flock", "motion channels, imitation of an expert"),
     Rows("olfati-saber"),
@@ -64,7 +63,7 @@ SHOWN = "flock"
 ANY_SIZE = "flock"
 """The policy that is evaluated with many flock sizes."""
 
-CURVES = ("paper-plain", "ddpg", "flock")
+CURVES = ("ddpg", "flock")
 """The policies whose training curves are drawn."""
 
 FLOCK_SIZES = (1, 2, 3, 5, 8, 12, 20, 50, 200)

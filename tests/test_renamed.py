@@ -163,8 +163,8 @@ def test_a_policy_under_its_old_name(old, new):
 
 def test_a_file_of_an_old_policys_name_is_that_file(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "paper-3v1o").write_bytes(load_policy("paper-plain").path.read_bytes())
-    assert load_policy("paper-3v1o").scenario == load_policy("paper-plain").scenario
+    (tmp_path / "paper-3v1o").write_bytes(load_policy("flock").path.read_bytes())
+    assert load_policy("paper-3v1o").scenario == load_policy("flock").scenario
 
 
 @pytest.fixture

@@ -77,7 +77,6 @@ def test_a_name_shows_its_card(capsys):
         assert expected in words
     words = text_of(shown(capsys, "ddpg"))
     assert "safety filter announce method ddpg: reinforcement learning alone trained" in words
-    assert "(walk), no safety filter method" in text_of(shown(capsys, "paper-plain"))
 
 
 def test_the_card_of_several_trainings_shows_their_median_and_range_and_every_task(capsys, monkeypatch):
