@@ -47,7 +47,7 @@ class Interruption(BaseCallback):
 
 
 def test_a_reward_term_is_in_the_infos_the_log_and_the_config(tmp_path):
-    output = run("reward", 3300, cwd=tmp_path)
+    output = run("reward", 4100, cwd=tmp_path)
     spacing = [float(value) for value in re.findall(r"'spacing': (-?[\d.]+)", output)]
     assert len(spacing) == 3
     assert min(spacing) < 0
@@ -74,7 +74,7 @@ def test_a_channel_is_in_the_observation_and_in_the_exported_graph(tmp_path):
 
 
 def test_a_controller_has_a_name_and_is_an_expert(tmp_path):
-    output = run("controller", 3300, cwd=tmp_path)
+    output = run("controller", 4100, cwd=tmp_path)
     errors = {name: float(error) for name, error in re.findall(r"(\S+): tracking error ([\d.]+) m", output)}
     assert list(errors) == ["potential-field", "orca", "student"]
     assert errors["potential-field"] < 0.1
@@ -82,9 +82,9 @@ def test_a_controller_has_a_name_and_is_an_expert(tmp_path):
 
 
 def test_an_algorithm_of_sb3_contrib_trains_saves_loads_and_evaluates(tmp_path):
-    output = run("algorithm", 3300, cwd=tmp_path)
+    output = run("algorithm", 4100, cwd=tmp_path)
     transitions = int(re.search(r"tqc_3v1o_1: TQCPolicy after (\d+) transitions", output)[1])
-    assert transitions >= 3300
+    assert transitions >= 4100
     assert 0 < float(re.search(r"tracking error ([\d.]+) m", output)[1]) < 3
     assert np.isfinite(last_logged(tmp_path, "train/critic_loss"))
     assert (tmp_path / "extend_algorithm.png").read_bytes().startswith(b"\x89PNG")
@@ -127,7 +127,7 @@ def test_a_parameter_of_ones_own_is_validated_and_takes_effect(tmp_path):
 
 
 def test_dynamics_of_ones_own_train_evaluate_and_render(tmp_path):
-    output = run("dynamics", 3300, cwd=tmp_path)
+    output = run("dynamics", 4100, cwd=tmp_path)
     assert "speed in the first step: 0.015 m/s" in output  # the mean of 0 and 0.03
     errors = {name: float(error) for name, error in re.findall(r"(\S+): tracking error ([\d.]+) m", output)}
     assert list(errors) == ["double-integrator", "unicycle"]

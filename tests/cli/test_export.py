@@ -32,7 +32,7 @@ def test_set_changes_the_scenario(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ("safety_filter=yes", "safety_filter = True: input should be 'off'"),
+        ("safety_filter=yes", "safety_filter = 'yes': input should be 'off'"),
         ("safety_filter=motion", "safety_filter = motion: motion_lag > 0 is needed"),
         ("motion_lag=0.2", "its observations have the shape"),
     ],

@@ -29,7 +29,7 @@ def test_without_arguments_of_ros_there_are_none(monkeypatch):
         (["no/such", "--vehicle", "0"], "no/such: no such file or run folder"),
         ([POLICY], "--vehicle"),
         ([POLICY, "--vehicle", "-1"], "-1: an integer of at least 0 is needed"),
-        ([POLICY, "--vehicle", "0", "--set", "safety_filter=yes"], "safety_filter = True: input should be 'off'"),
+        ([POLICY, "--vehicle", "0", "--set", "safety_filter=yes"], "safety_filter = 'yes': input should be 'off'"),
         ([POLICY, "--vehicle", "0", "--ros-arg", "-p", "rate:=5"], "did you mean --ros-args?"),
     ],
 )

@@ -48,9 +48,7 @@ def test_sb3_loads_a_shipped_policy_and_learns_with_any_number_of_slots(name, n_
 
 def test_the_path_of_a_shipped_policy():
     assert policy_path("flock") == shipped_policies()["flock"]
-    with pytest.raises(
-        SettingsError, match=r"policy = 'flok': one of ddpg, flock is needed; did you mean flock\?"
-    ):
+    with pytest.raises(SettingsError, match=r"policy = 'flok': one of ddpg, flock is needed; did you mean flock\?"):
         policy_path("flok")
     assert set(POLICIES.values()) == {"ddpg", "flock"}
     assert not NAMES & set(POLICIES)

@@ -113,4 +113,4 @@ def test_mistakes_are_one_line():
         with pytest.raises(
             SettingsError, match=f"motion_lag = {motion_lag}: .* multiple of 0.2 s, the training env's sampling period"
         ):
-            TrainingConfig(scenario=Scenario(motion_lag=motion_lag))
+            TrainingConfig(scenario=Scenario(motion_lag=motion_lag), train_env={"time_step_scale": 2.0})
