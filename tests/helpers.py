@@ -1,6 +1,9 @@
 """What several test modules share: tiny trainings, worlds placed by hand, and comparisons of states."""
 
 import io
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -121,3 +124,16 @@ def assert_equal_rollouts(one, other, steps):
         assert data_equivalence(ours[3], theirs[3], exact=True)
         seen.append(theirs[3])
     return seen
+
+
+def run_example(name, *arguments, cwd):
+    """What an example prints. It runs on one torch thread, as the tests do."""
+    example = Path(__file__).parents[1] / "examples" / name
+    return subprocess.run(
+        [sys.executable, example, *map(str, arguments)],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        check=True,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    ).stdout

@@ -3,7 +3,6 @@
 import csv
 import re
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -15,19 +14,13 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_flock import FlockCNN, load_policy, resume, train
 from sb3_flock.rl.registry import ALGORITHMS, AlgorithmSpec, extractor_kwargs
 from sb3_flock.sim.reward import EXTRA_TERMS
-from tests.helpers import quiet, tiny, training_state
+from tests.helpers import quiet, run_example, tiny, training_state
 
 ROOT = Path(__file__).parents[1]
 
 
 def run(name, *arguments, cwd):
-    return subprocess.run(
-        [sys.executable, ROOT / "examples" / f"extend_{name}.py", *map(str, arguments)],
-        cwd=cwd,
-        capture_output=True,
-        text=True,
-        check=True,
-    ).stdout
+    return run_example(f"extend_{name}.py", *arguments, cwd=cwd)
 
 
 def last_logged(folder, key):

@@ -79,7 +79,7 @@ def test_rl_zoo3_trains_with_the_neighbors_rewards(tmp_path):
     """``python -m rl_zoo3.train`` in a process of its own, 500 steps; the callback logs the mixed return."""
     command = [sys.executable, "-m", "rl_zoo3.train", "--algo", "ddpg", "--env", ID, "--gym-packages", "sb3_flock"]
     command += ["-c", str(CONFIG), "-n", "500", "-f", str(tmp_path), "--eval-freq", "80", "--eval-episodes", "5"]
-    command += ["--seed", "3", "--tensorboard-log", str(tmp_path / "tb"), "--log-interval", "1"]
+    command += ["--seed", "3", "--tensorboard-log", str(tmp_path / "tb"), "--log-interval", "1", "--num-threads", "1"]
     command += [
         "-params",
         "learning_starts:100",
