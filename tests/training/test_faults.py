@@ -211,6 +211,7 @@ def obey_permissions():
     ctypes.CDLL(None).prctl(24, 1)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Linux capabilities")
 def test_a_folder_that_turns_read_only_is_one_line_and_leaves_what_was_saved(tmp_path, start):
     _, path = config_file(tmp_path)
