@@ -158,7 +158,6 @@ def test_an_interrupted_sweep_says_how_to_resume(tmp_path):
     assert {row["status"] for row in results(out)} <= {"unfinished", "done"}
 
 
-@pytest.mark.slow
 def test_a_search_prints_its_best_trials(tmp_path):
     space = "{learning_rate: {low: 0.0001, high: 0.01, log: true}, batch_size: {low: 8, high: 32}, gamma: [0.9, 0.96]}"
     file, out = sweep_file(tmp_path, f"base: {SMALL}\nsearch: {space}\ntrials: 2\n"), tmp_path / "out"
