@@ -76,9 +76,9 @@ def _list() -> Table:
 
 def _config(card: Mapping[str, Any]) -> TrainingConfig:
     from sb3_flock.config.training import TrainingConfig
-    from sb3_flock.serialization.migrate import migrate_config
+    from sb3_flock.serialization.migrate import migrate_card
 
-    return TrainingConfig(**migrate_config(TrainingConfig, card["config"], card.get("format", 3))[0])
+    return TrainingConfig(**migrate_card(TrainingConfig, card)[0])
 
 
 def _shipped(card: Mapping[str, Any]) -> dict[str, Any]:

@@ -62,6 +62,14 @@ def migrate_config(
     return current, renamed
 
 
+def migrate_card(settings: type[Settings], card: Mapping[str, Any]) -> tuple[dict[str, Any], list[tuple[str, str]]]:
+    """:func:`migrate_config` for the config in a model card; the first cards had no format number.
+
+    :raises SettingsError: for a format that this version does not read
+    """
+    return migrate_config(settings, card["config"], check_format(card.get("format", 3)))
+
+
 def _rename(
     settings: type[Settings], values: Mapping[str, Any], prefix: str
 ) -> tuple[dict[str, Any], list[tuple[str, str]]]:

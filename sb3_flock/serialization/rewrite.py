@@ -21,7 +21,7 @@ from sb3_flock.envs.vec_env import make_vec_env
 from sb3_flock.rl.registry import build_model
 from sb3_flock.serialization.archive import read_member, read_text
 from sb3_flock.serialization.load import PolicyError, first_line, load_policy
-from sb3_flock.serialization.migrate import FORMAT, MEMBER, check_format, format_of, migrate_config
+from sb3_flock.serialization.migrate import FORMAT, MEMBER, format_of, migrate_card, migrate_config
 from sb3_flock.serialization.save import atomic_write
 from sb3_flock.serialization.yaml_io import check_groups, read_yaml, to_yaml
 from sb3_flock.settings import SettingsError, UserError, leaf_paths
@@ -135,10 +135,9 @@ def _card(path: Path) -> bytes | None:
         raise SettingsError(f"{path}: not a JSON file ({first_line(error)})") from None
     if not isinstance(card, dict) or not isinstance(card.get("config"), dict) or "seeds" not in card:
         raise SettingsError(f"{path}: not a model card (it has no config and seeds)")
-    number = card.get("format", 3)  # the first cards had none
     with _errors_of(path):
-        values, renamed = migrate_config(TrainingConfig, card["config"], check_format(number))
-    if number == FORMAT and not renamed:
+        values, renamed = migrate_card(TrainingConfig, card)
+    if card.get("format") == FORMAT and not renamed:
         return None
     with _errors_of(path):
         config = TrainingConfig(**values).model_dump(mode="json")

@@ -68,9 +68,7 @@ class TrialsTable(tune.Callback):
             self._draw(trials)
         else:
             counts = Counter(map(_state, trials))
-            self.console.print(
-                f"[{counts['done']} of {len(trials)} done] {line}", soft_wrap=True, markup=False, highlight=False
-            )
+            self.console.print(f"[{counts['done']} of {len(trials)} done] {line}", soft_wrap=True)
 
     def _draw(self, trials: list[Any]) -> None:
         self._drawn = time.monotonic()
