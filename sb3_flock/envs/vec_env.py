@@ -158,7 +158,7 @@ class ParameterSharingVecEnv(SB3VecEnvWrapper):
         self._unseeded = True
         self._options: dict[str, Any] | None = None
         self._closed = False
-        self._monitors, self._started = monitor, time.time()
+        self._monitors, self._started = monitor, time.monotonic()
         self._returns, self._lengths = np.zeros(self.num_envs), np.zeros(self.num_envs, int)
 
     # -- seeding -----------------------------------------------------------------------------------------------------
@@ -225,7 +225,7 @@ class ParameterSharingVecEnv(SB3VecEnvWrapper):
         if self._monitors:
             self._returns += rewards
             self._lengths += [info["alive"] for info in infos]
-            seconds = round(time.time() - self._started, 6)
+            seconds = round(time.monotonic() - self._started, 6)
             for slot in ends:
                 infos[slot]["episode"] = {"r": float(self._returns[slot]), "l": int(self._lengths[slot]), "t": seconds}
             self._returns[ends], self._lengths[ends] = 0, 0

@@ -1,13 +1,16 @@
-"""Files from strangers: what a file unpacks to is bounded before it is unpacked. Importable without torch."""
+"""Reading and writing zips. What a file from a stranger unpacks to is bounded before it is unpacked. Importable without torch."""
 
 from __future__ import annotations
 
 import io
+import time
 import zipfile
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+
+from sb3_flock.errors import SettingsError
 
 MAX_TEXT = 2**18
 """Largest number of bytes of a config, 20 times our longest: PyYAML reads about 100 kB a second."""
@@ -24,6 +27,16 @@ def check_size(archive: zipfile.ZipFile, limit: int) -> None:
     size = sum(info.file_size for info in archive.infolist())
     if size > limit:
         raise ValueError(f"it unpacks to {size} bytes: at most {limit} are read")
+
+
+def check_clock() -> None:
+    """Check that the system's clock is at a time that a zip can hold, as it is not on a computer that starts without one.
+
+    :raises SettingsError: if it is before 1980
+    """
+    now = time.localtime()
+    if now.tm_year < 1980:
+        raise SettingsError(f"the system's clock says {time.strftime('%Y-%m-%d', now)}: zip files need a date from 1980 on")
 
 
 def read_member(archive: zipfile.ZipFile, name: str, limit: int) -> bytes:

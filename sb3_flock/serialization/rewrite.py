@@ -19,7 +19,7 @@ from sb3_flock._renamed import POLICIES, rename_key
 from sb3_flock.config.training import TrainingConfig
 from sb3_flock.envs.vec_env import make_vec_env
 from sb3_flock.rl.registry import build_model
-from sb3_flock.serialization.archive import read_member, read_text
+from sb3_flock.serialization.archive import check_clock, read_member, read_text
 from sb3_flock.serialization.load import PolicyError, first_line, load_policy
 from sb3_flock.serialization.migrate import FORMAT, MEMBER, format_of, migrate_card, migrate_config
 from sb3_flock.serialization.save import atomic_write
@@ -87,6 +87,7 @@ def _policy(path: Path) -> bytes | None:
             return None
         kept = {name: read_member(archive, name, _MAX_MEMBER) for name in names if _stays(name, number)}
         data = json.loads(read_member(archive, "data", _MAX_MEMBER))
+    check_clock()
     model = _fresh_model(loaded.config)
     model.policy.load_state_dict(loaded.policy.state_dict())
     stored, written = io.BytesIO(), io.BytesIO()

@@ -28,6 +28,7 @@ from sb3_flock._compat import EPISODE_STATE, optimizers_of
 from sb3_flock.config.training import TrainingConfig
 from sb3_flock.rl.registry import policy_kwargs
 from sb3_flock.rl.settings import NetworkConfig
+from sb3_flock.serialization.archive import check_clock
 from sb3_flock.serialization.load import build_policy
 from sb3_flock.serialization.migrate import FORMAT, MEMBER
 from sb3_flock.settings import SettingsError
@@ -58,10 +59,12 @@ def save_model(
     :param extra: writes further members
     :return: the path
     :raises SettingsError: if the model's observations, actions or networks are not the config's, with the field that differs; for
-        a model with observations normalized by ``VecNormalize``, whose statistics the file would not hold
+        a model with observations normalized by ``VecNormalize``, whose statistics the file would not hold; for a system's
+        clock before 1980
     :raises OSError: if it cannot be written; an earlier file of that name stays
     """
     path = Path(path)
+    check_clock()
     vec_normalize = model.get_vec_normalize_env()
     if vec_normalize is not None and vec_normalize.norm_obs:
         raise SettingsError(

@@ -288,7 +288,9 @@ class World:
             if state[name].shape != shape:
                 raise ValueError(f"{name} has the shape {state[name].shape}: {shape} is needed")
             setattr(self, name, np.array(state[name], dtype=np.float64))
-        self.steps = int(state["steps"])
+        if type(state["steps"]) is not int or not 0 <= state["steps"] <= self.scenario.max_cycles:
+            raise ValueError(f"steps = {state['steps']}: 0 to {self.scenario.max_cycles} are possible")
+        self.steps = state["steps"]
         drawn = state.get("drawn", {})
         if drawn or self.drawn:
             self._use({name: np.array(values, dtype=np.float64) for name, values in drawn.items()})

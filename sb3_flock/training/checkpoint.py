@@ -38,9 +38,10 @@ from sb3_flock.rl.ddpg import FlockTD3
 from sb3_flock.rl.registry import ALGORITHMS, uses_compact_buffer
 from sb3_flock.serialization.archive import check_size, read_member
 from sb3_flock.serialization.load import PolicyError, checkpoint_paths, first_line, read_tensors
-from sb3_flock.serialization.migrate import MEMBER, check_format, migrate_state
+from sb3_flock.serialization.migrate import MEMBER, check_format, migrate_config, migrate_state
 from sb3_flock.serialization.save import save_model, versions
 from sb3_flock.sim.backend import compiled
+from sb3_flock.training.checkpoint_schema import check_state
 
 _VALUES = "training.json"
 _ARRAYS = "training/"
@@ -82,7 +83,7 @@ def save_checkpoint(model: OffPolicyAlgorithm, path: Path, config: TrainingConfi
 
 
 class LoadedCheckpoint:
-    """A checkpoint in memory, whole and well-formed.
+    """A checkpoint in memory, whole and well-formed; ``config`` is the one of the training that saved it.
 
     :param path: the zip
     :param limit: largest number of bytes that it may unpack to
@@ -106,15 +107,19 @@ class LoadedCheckpoint:
                     for name in archive.namelist()
                     if name.endswith(".pth")
                 }
-                number = check_format(json.loads(read_member(archive, MEMBER, limit))["format"])
+                member = json.loads(read_member(archive, MEMBER, limit))
+            number = check_format(member["format"])
+            self.config = TrainingConfig(**migrate_config(TrainingConfig, member["config"], number)[0])
             self.state = migrate_state(_put_arrays(values, arrays), number)
+            check_state(self.state)
         except Exception as error:  # zipfile, json, NumPy and torch raise many kinds for a damaged file
             raise PolicyError(f"{path}: damaged or not a checkpoint ({first_line(error)})") from None
 
     @property
     def num_timesteps(self) -> int:
         """Transitions of the training when it was saved."""
-        return int(self.state["model"]["num_timesteps"])
+        number: int = self.state["model"]["num_timesteps"]
+        return number
 
     @property
     def runtime_info(self) -> dict[str, str]:
@@ -153,10 +158,8 @@ class LoadedCheckpoint:
             raise PolicyError(f"{self.path}: not a checkpoint of this run's config ({first_line(error)})") from None
 
 
-def newest_checkpoint(
-    folder: Path, config: TrainingConfig, report: Callable[[str], None] = lambda line: None
-) -> LoadedCheckpoint | None:
-    """The newest whole checkpoint of a run folder, or ``None``.
+def whole_checkpoints(folder: Path, config: TrainingConfig, report: Callable[[str], None]) -> Iterator[LoadedCheckpoint]:
+    """The whole checkpoints of a run folder, newest first.
 
     :param config: the run's config, which bounds the size of what is read
     :param report: called with one line about each damaged checkpoint, which is skipped
@@ -166,10 +169,9 @@ def newest_checkpoint(
     limit = _MAX_WITHOUT_REPLAY + 4 * (2 * pixels + 16) * (config.algorithm.buffer_size + 2 * slots)
     for path in reversed(checkpoint_paths(folder)):
         try:
-            return LoadedCheckpoint(path, limit)
+            yield LoadedCheckpoint(path, limit)
         except PolicyError as error:
             report(f"skipped {error}")
-    return None
 
 
 def reproducibility_warnings(checkpoint: LoadedCheckpoint | None, config: TrainingConfig) -> str:

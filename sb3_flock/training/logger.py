@@ -11,6 +11,7 @@ from pathlib import Path
 from stable_baselines3.common.logger import CSVOutputFormat, Logger, TensorBoardOutputFormat
 from torch.utils.tensorboard import SummaryWriter
 
+from sb3_flock.errors import RunError
 from sb3_flock.serialization.save import atomic_write
 
 _STEPS = "time/total_timesteps"
@@ -42,18 +43,30 @@ def quiet_writer_thread() -> Iterator[None]:
         threading.excepthook = hook
 
 
+def _rows_until(path: Path, num_timesteps: int) -> list[list[str]]:
+    """The header and the rows of up to so many transitions; nothing without a column of transitions."""
+    with open(path, newline="", encoding="utf-8") as file:
+        header, *rows = list(csv.reader(file)) or [[]]
+    if _STEPS not in header:
+        return []
+    column = header.index(_STEPS)
+    rows = [row for row in rows if len(row) == len(header)]  # a killed run may leave half a row
+    return [header, *(row for row in rows if row[column] and int(row[column]) <= num_timesteps)]
+
+
 class _ContinuedCSV(CSVOutputFormat):
-    """SB3's ``progress.csv`` that keeps the earlier rows of up to ``num_timesteps`` transitions."""
+    """SB3's ``progress.csv`` that keeps the earlier rows of up to ``num_timesteps`` transitions.
+
+    :raises RunError: if there is another file in its place
+    """
 
     def __init__(self, path: Path, num_timesteps: int) -> None:
         kept: list[list[str]] = []
         if num_timesteps and path.exists():
-            with open(path, newline="", encoding="utf-8") as file:
-                header, *rows = list(csv.reader(file)) or [[]]
-            if _STEPS in header:
-                column = header.index(_STEPS)
-                rows = [row for row in rows if len(row) == len(header)]  # a killed run may leave half a row
-                kept = [header, *(row for row in rows if row[column] and int(row[column]) <= num_timesteps)]
+            try:
+                kept = _rows_until(path, num_timesteps)
+            except (ValueError, csv.Error) as error:
+                raise RunError(f"{path}: not the log of a training ({error}); move it away to go on without it") from None
         with atomic_write(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
             csv.writer(file, lineterminator="\n").writerows(kept)
         self.file = open(path, "r+", encoding="utf-8")  # noqa: SIM115 - closed by close()

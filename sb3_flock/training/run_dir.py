@@ -18,8 +18,20 @@ from sb3_flock.serialization.yaml_io import to_yaml
 from sb3_flock.settings import SettingsError
 
 
+def check_encoding(folder: str | Path) -> None:
+    """Check that a folder's name is UTF-8, which TensorBoard needs.
+
+    :raises SettingsError: if it is not
+    """
+    try:
+        str(folder).encode()
+    except UnicodeEncodeError:
+        raise SettingsError(f"{folder}: TensorBoard needs a name in UTF-8") from None
+
+
 def create_run_dir(config: TrainingConfig, command: Sequence[str] | None) -> Path:
     """Create the next free ``<algo>_<n>v<m>o_<k>`` with its description; two trainings at once never share one."""
+    check_encoding(config.output_dir)
     root = Path(config.output_dir)
     stem = f"{config.algo}_{config.scenario.n_vehicles}v{config.scenario.n_obstacles}o"
     try:
@@ -62,6 +74,6 @@ def describe_run(folder: Path, config: TrainingConfig, command: Sequence[str] | 
     """Write the config, the command (one more line if resumed) and the versions."""
     with atomic_write(folder / "config.yaml") as temporary:
         temporary.write_text(to_yaml(config), encoding="utf-8")
-    with open(folder / "command.txt", "a", encoding="utf-8") as file:
-        file.write(shlex.join(command or sys.argv) + "\n")
+    with open(folder / "command.txt", "ab") as file:
+        file.write(os.fsencode(shlex.join(command or sys.argv) + "\n"))  # a path need not be UTF-8
     (folder / "versions.txt").write_text("".join(f"{name}=={number}\n" for name, number in versions().items()))

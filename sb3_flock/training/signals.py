@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM during a training: the training saves first, then stops."""
+"""SIGINT, SIGTERM and SIGHUP during a training: the training saves first, then stops."""
 
 from __future__ import annotations
 
@@ -8,9 +8,12 @@ import threading
 from collections.abc import Iterator
 from types import FrameType
 
+_SIGNALS = [signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else [])]
+"""An interrupt, a request to end, and a terminal that closes, which Windows does not have."""
+
 
 class GracefulShutdown:
-    """Delays SIGINT and SIGTERM until the training has saved; a second signal acts at once.
+    """Delays these signals until the training has saved; a second signal acts at once.
 
     Python delivers signals to the main thread alone: in any other thread nothing is delayed.
     """
@@ -24,7 +27,7 @@ class GracefulShutdown:
         if threading.current_thread() is not threading.main_thread():
             yield self
             return
-        before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+        before = {number: signal.getsignal(number) for number in _SIGNALS}
         taken = {number: handler for number, handler in before.items() if handler != signal.SIG_IGN}  # as under nohup
         for number in taken:
             signal.signal(number, self._keep)
@@ -45,8 +48,9 @@ class GracefulShutdown:
         """Raise what the caught signal asks for.
 
         :raises KeyboardInterrupt: for SIGINT
-        :raises SystemExit: for SIGTERM, with the code 143
+        :raises SystemExit: for the others, with 128 and the signal's number as the code
         """
+        assert self.caught is not None
         if self.caught == signal.SIGINT:
             raise KeyboardInterrupt
-        raise SystemExit(128 + signal.SIGTERM)
+        raise SystemExit(128 + self.caught)

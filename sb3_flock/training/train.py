@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import functools
+import itertools
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,23 +34,24 @@ from sb3_flock.rl.callbacks import (
 from sb3_flock.rl.compiled_update import can_compile
 from sb3_flock.rl.ddpg import FlockTD3
 from sb3_flock.rl.registry import build_model
+from sb3_flock.serialization.archive import check_clock
 from sb3_flock.serialization.load import PolicyError, check_device, checkpoint_paths, load_policy
 from sb3_flock.serialization.save import save_model
 from sb3_flock.serialization.yaml_io import load_config
-from sb3_flock.settings import RunError, SettingsError
+from sb3_flock.settings import RunError, SettingsError, leaf_paths
 from sb3_flock.sim import Scenario, World, episode_rng
 from sb3_flock.training.checkpoint import (
     LoadedCheckpoint,
     Stateful,
-    newest_checkpoint,
     reproducibility_warnings,
     save_checkpoint,
+    whole_checkpoints,
 )
 from sb3_flock.training.checkpoint_callback import CheckpointCallback
 from sb3_flock.training.eval_callback import FlockEvalCallback
 from sb3_flock.training.logger import make_logger, quiet_writer_thread
 from sb3_flock.training.progress_callback import FlockProgressCallback
-from sb3_flock.training.run_dir import create_run_dir, describe_run, lock_run_dir
+from sb3_flock.training.run_dir import check_encoding, create_run_dir, describe_run, lock_run_dir
 from sb3_flock.training.signals import GracefulShutdown
 
 _WIDE_BATCH = 1024
@@ -76,8 +79,8 @@ def train(
 
     The folder holds ``config.yaml`` (fully resolved), ``command.txt``, ``versions.txt``, TensorBoard's events and
     ``progress.csv``, ``evaluations.npz``, the newest checkpoints ``rl_model_<steps>_steps.zip``, ``best_model.zip`` (lowest
-    :func:`~sb3_flock.evaluation.metrics.score` at an evaluation) and, once it is complete, ``final_model.zip``. SIGINT and
-    SIGTERM are delayed until a checkpoint is saved; :func:`resume` continues from one.
+    :func:`~sb3_flock.evaluation.metrics.score` at an evaluation) and, once it is complete, ``final_model.zip``. SIGINT,
+    SIGTERM and SIGHUP are delayed until a checkpoint is saved; :func:`resume` continues from one.
 
     :param config: everything that decides the training
     :param console: where progress goes; the default prints to stderr
@@ -116,12 +119,14 @@ def resume(
     :param changes: fields of the config to change: those in :data:`RESUMABLE`
     :param command: the command line, added to ``command.txt``
     :param callbacks: as in :func:`train`; their states are not in the checkpoint
-    :raises SettingsError: for a folder that is not a run's or is in use, a field that cannot change, a run that is complete
+    :raises SettingsError: for a folder that is not a run's or is in use, a field that cannot change, in ``changes`` or by an
+        edit of ``config.yaml``, a run that is complete
     :raises RunError: as in :func:`train`
     """
     folder, console = Path(folder), console or PlainConsole(stderr=True)
     if not (folder / "config.yaml").is_file():
         raise SettingsError(f"resume {folder}: not a run folder (there is no config.yaml)")
+    check_encoding(folder)
     config = load_config(TrainingConfig, folder / "config.yaml")
     fixed = [name for name in changes or {} if name not in RESUMABLE]
     if fixed:
@@ -134,20 +139,8 @@ def resume(
     with GracefulShutdown().waiting() as signals, lock_run_dir(folder), _faults_as_run_errors(folder):
         for half_written in folder.glob(".*.tmp"):
             half_written.unlink()
-        checkpoint = newest_checkpoint(folder, config, report)
-        done = checkpoint.num_timesteps if checkpoint else 0
-        is_complete = done >= config.total_timesteps and (folder / "final_model.zip").exists()
-        if is_complete or ("total_timesteps" in (changes or {}) and done >= config.total_timesteps):
-            raise SettingsError(
-                f"resume {folder}: {done} transitions are done; a larger total_timesteps than {config.total_timesteps} is "
-                "needed to continue"
-            )
-        model, env = _prepare(config)
+        checkpoint, model, env = _restore(folder, config, changes or {}, report)
         try:
-            why = reproducibility_warnings(checkpoint, config)
-            report(f"resumes {folder} after {done} of {config.total_timesteps} transitions{why}")
-            if checkpoint:
-                checkpoint.restore_model(model)
             describe_run(folder, config, command)
             return _run(config, folder, model, checkpoint, console, callbacks, signals)
         finally:
@@ -168,10 +161,64 @@ RESUMABLE = (
 """Fields that a resumed run may change: except for the first, they hardly change what is learned."""
 
 
+def _restore(
+    folder: Path, config: TrainingConfig, changes: Mapping[str, Any], report: Callable[[str], None]
+) -> tuple[LoadedCheckpoint | None, OffPolicyAlgorithm, VecEnv]:
+    """The newest checkpoint that can be restored, the model that continues from it, and its env; without one, a new model."""
+    for checkpoint in itertools.chain(whole_checkpoints(folder, config, report), [None]):
+        done = checkpoint.num_timesteps if checkpoint else 0
+        is_complete = done >= config.total_timesteps and (folder / "final_model.zip").exists()
+        if is_complete or ("total_timesteps" in changes and done >= config.total_timesteps):
+            raise SettingsError(
+                f"resume {folder}: {done} transitions are done; a larger total_timesteps than {config.total_timesteps} is "
+                "needed to continue"
+            )
+        edits = _edits(checkpoint, config) if checkpoint else ""
+        model, env = _prepare(config)
+        try:
+            if checkpoint:
+                checkpoint.restore_model(model)
+        except PolicyError as error:
+            env.close()
+            report(f"skipped {error}")
+        except BaseException:
+            env.close()
+            raise
+        else:
+            why = reproducibility_warnings(checkpoint, config)
+            report(f"resumes {folder} after {done} of {config.total_timesteps} transitions{edits}{why}")
+            return checkpoint, model, env
+    raise AssertionError("unreachable")
+
+
+def _edits(checkpoint: LoadedCheckpoint, config: TrainingConfig) -> str:
+    """What differs from the checkpoint's own config, as a part of a line.
+
+    :raises SettingsError: if it is none of :data:`RESUMABLE`
+    """
+    values, own = (dict(_leaves(each)) for each in (config, checkpoint.config))
+    edits = {name: (own[name], value) for name, value in values.items() if value != own[name] and name != "output_dir"}
+    fixed = [
+        f"{name} = {new} ({old} in {checkpoint.path.name})" for name, (old, new) in edits.items() if name not in RESUMABLE
+    ]
+    if fixed:
+        raise SettingsError(
+            f"{checkpoint.path.parent / 'config.yaml'}: {', '.join(fixed)}: these cannot change in a resumed run"
+        )
+    return "".join(f"; {name} = {new} ({old} before)" for name, (old, new) in edits.items())
+
+
+def _leaves(config: TrainingConfig) -> Iterator[tuple[str, Any]]:
+    """Every parameter of a config with its whole name."""
+    for path in leaf_paths(TrainingConfig):
+        yield ".".join(path), functools.reduce(getattr, path, config)
+
+
 def _prepare(config: TrainingConfig) -> tuple[OffPolicyAlgorithm, VecEnv]:
     """The untrained model and its env; every error in a config is raised here, before there is a run folder."""
     th.set_num_threads(config.torch_threads or (1 if config.algorithm.batch_size < _WIDE_BATCH else cores()))
     check_device(config.device)
+    check_clock()
     for scenario in (config.scenario, *config.training_scenarios()):  # raises if the arena is too crowded
         World(scenario).reset([episode_rng(config.seed, 0)])
     env = VecMonitor(make_training_env(config))
@@ -258,8 +305,8 @@ def _run(
     ]
     if model.action_noise is not None:
         parts.append(LinearNoiseDecay(config.algorithm.action_noise_std, config.algorithm.final_action_noise_std))
+    model.set_logger(make_logger(folder, model.num_timesteps))
     try:
-        model.set_logger(make_logger(folder, model.num_timesteps))
         with quiet_writer_thread():
             model.learn(
                 config.total_timesteps - model.num_timesteps,

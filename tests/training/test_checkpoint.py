@@ -1,16 +1,18 @@
 import csv
 import functools
+import io
 import zipfile
 
 import numpy as np
 import pytest
 import torch as th
+from rich.console import Console
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_flock.config.training import TrainingConfig
 from sb3_flock.serialization.load import PolicyError, checkpoint_paths
 from sb3_flock.serialization.yaml_io import load_config, to_yaml
-from sb3_flock.settings import SettingsError
+from sb3_flock.settings import SettingsError, resolve_path
 from sb3_flock.training.checkpoint import LoadedCheckpoint, reproducibility_warnings
 from sb3_flock.training.train import resume, train
 from tests.helpers import quiet, tiny, training_state
@@ -108,12 +110,40 @@ def test_another_runtime_is_reported(tmp_path):
     assert "worker processes start new episodes" in reproducibility_warnings(checkpoint, first.config.replace(num_cpus=2))
 
 
-def test_a_checkpoint_of_another_config_is_refused(tmp_path):
+@pytest.mark.parametrize(
+    "edit",
+    [{"gamma": 0.5}, {"reward.lambda_": 0.1}, {"seed": 7}, {"algo": "td3"}, {"features_dim": 24}, {"safety_filter": "off"}],
+)
+def test_an_edited_config_that_changes_what_is_learned_is_refused(tmp_path, edit):
     first = train(tiny(tmp_path), quiet())
-    wider = tiny(tmp_path, features_dim=24, total_timesteps=900)
-    (first.folder / "config.yaml").write_text(to_yaml(wider))
-    with pytest.raises(PolicyError, match="not a checkpoint of this run's config"):
+    ((name, value),) = edit.items()
+    whole = ".".join(resolve_path(TrainingConfig, name))
+    edited = load_config(TrainingConfig, overrides={**edit, "total_timesteps": 420}, base=first.config)
+    (first.folder / "config.yaml").write_text(to_yaml(edited))
+    newest = checkpoint_paths(first.folder)[-1].name
+    with pytest.raises(SettingsError, match=rf"config.yaml: {whole} = {value} \(.* in {newest}\): these cannot change"):
         resume(first.folder, quiet())
+    assert load_config(TrainingConfig, first.folder / "config.yaml") == edited
+    assert checkpoint_paths(first.folder)[-1].name == newest
+
+
+def test_a_resumed_run_says_what_changed_since_its_checkpoint(tmp_path):
+    first = train(tiny(tmp_path), quiet())
+    edited = load_config(TrainingConfig, overrides={"n_test_episodes": 3, "output_dir": "elsewhere"}, base=first.config)
+    (first.folder / "config.yaml").write_text(to_yaml(edited))
+    shown = io.StringIO()
+    resume(first.folder, Console(file=shown, width=300), {"total_timesteps": 420})
+    tests = first.config.n_test_episodes
+    line = f"after 300 of 420 transitions; total_timesteps = 420 (300 before); n_test_episodes = 3 ({tests} before)\n"
+    assert line in shown.getvalue()
+
+
+def test_a_checkpoint_that_does_not_fit_its_own_config_is_refused(tmp_path):
+    first = train(tiny(tmp_path), quiet())
+    checkpoint = LoadedCheckpoint(checkpoint_paths(first.folder)[-1], 10**9)
+    del checkpoint.state["model"]["replay"]
+    with pytest.raises(PolicyError, match=r"not a checkpoint of this run's config \('replay'\)"):
+        checkpoint.restore_model(first.model)
 
 
 def test_what_all_parts_of_a_checkpoint_unpack_to_is_bounded(tmp_path):

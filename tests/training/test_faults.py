@@ -3,6 +3,7 @@
 import contextlib
 import ctypes
 import io
+import json
 import os
 import random
 import resource
@@ -11,16 +12,21 @@ import signal
 import subprocess
 import sys
 import time
+import zipfile
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch as th
 from rich.console import Console
+from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_flock import resume, train
+from sb3_flock.serialization.archive import read_curves
 from sb3_flock.serialization.load import checkpoint_paths, load_policy
 from sb3_flock.serialization.yaml_io import to_yaml
+from sb3_flock.settings import SettingsError
 from sb3_flock.training.checkpoint import LoadedCheckpoint
 from tests.helpers import quiet, tiny, training_state
 
@@ -117,6 +123,14 @@ def newest(folder):
     return LoadedCheckpoint(checkpoint_paths(folder)[-1], 10**9)
 
 
+def assert_same_ends(folder, alone):
+    """That a run ended as the training that was left alone, to the last bit."""
+    ours, theirs = training_state(SimpleNamespace(folder=folder)), training_state(alone)
+    assert ours.keys() == theirs.keys()
+    for name, value in ours.items():
+        np.testing.assert_array_equal(value, theirs[name], err_msg=name)
+
+
 def survive(kills, total, tmp_path, start):
     """Kill a run so often, at random moments; then let it end and compare it with one that was left alone."""
     config, path = config_file(tmp_path, total_timesteps=total, buffer_size=3000)
@@ -142,14 +156,7 @@ def survive(kills, total, tmp_path, start):
     assert code == 0, errors
     alone = train(config.replace(output_dir=str(tmp_path / "alone")), quiet())
 
-    class Killed:
-        pass
-
-    Killed.folder = folder
-    ours, theirs = training_state(Killed), training_state(alone)
-    assert ours.keys() == theirs.keys()
-    for name, value in ours.items():
-        np.testing.assert_array_equal(value, theirs[name], err_msg=name)
+    assert_same_ends(folder, alone)
 
 
 def test_a_killed_run_resumes_and_ends_as_if_never_killed(tmp_path, start):
@@ -162,7 +169,7 @@ def test_twenty_kills(tmp_path, start):
     survive(20, 20_000, tmp_path, start)
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
 def test_a_signal_saves_first_and_prints_how_to_resume(tmp_path, start, number, code):
     _, path = config_file(tmp_path, save_freq=0)
     run = start("--config", path)
@@ -177,7 +184,7 @@ def test_a_signal_saves_first_and_prints_how_to_resume(tmp_path, start, number, 
     if number == signal.SIGINT:
         code, _, errors = start("--resume", folder, "--total-timesteps", steps + 60).end()
         assert code == 0
-        assert f"resumes {folder} after {steps} of {steps + 60} transitions\n" in errors
+        assert f"resumes {folder} after {steps} of {steps + 60} transitions; total_timesteps = {steps + 60} (" in errors
 
 
 def test_a_full_disk_is_one_line_and_leaves_what_was_saved(tmp_path, start):
@@ -298,6 +305,98 @@ def test_a_damaged_newest_checkpoint_is_skipped(tmp_path, damage):
     assert f"resumes {result.folder} after {steps} of 600 transitions" in printed
     assert last.read_bytes() != whole[:middle]
     assert newest(result.folder).num_timesteps == 600
+
+
+@pytest.mark.parametrize(
+    ("damage", "why"),
+    [
+        (lambda state: state["model"].update(num_timesteps=-1), "model.num_timesteps: "),
+        (lambda state: state["model"].update(num_timesteps=True), "model.num_timesteps: "),
+        (lambda state: state["model"]["replay"].update(pos=10**6), "model.replay: Value error, position 1000000 in"),
+        (lambda state: state["model"]["env"][0]["world"].update(steps=21), "steps = 21: 0 to 20 are possible"),
+        (lambda state: state["parts"]["evaluation"].update(last="x"), "parts.evaluation.last: "),
+        (lambda state: state["parts"].pop("metrics"), "parts.metrics: "),
+    ],
+)
+def test_a_newest_checkpoint_with_values_that_cannot_be_is_skipped(tmp_path, damage, why):
+    result = train(tiny(tmp_path, total_timesteps=600, save_freq=150), quiet())
+    older, last = checkpoint_paths(result.folder)
+    with zipfile.ZipFile(last) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    state = json.loads(members["training.json"])
+    damage(state)
+    members["training.json"] = json.dumps(state).encode()
+    with zipfile.ZipFile(last, "w") as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+    (result.folder / "final_model.zip").unlink()  # as of a run that did not end
+    steps = LoadedCheckpoint(older, 10**9).num_timesteps
+    console = Console(file=io.StringIO(), width=500)
+    resume(result.folder, console)
+    skipped, resumed = console.file.getvalue().splitlines()[:2]
+    assert skipped.startswith(f"skipped {last}: ")
+    assert why in skipped
+    assert resumed.startswith(f"resumes {result.folder} after {steps} of 600 transitions")
+    assert newest(result.folder).num_timesteps == 600
+
+
+def pause(seconds, tmp_path, start):
+    """Stop a run as a laptop that sleeps does, let it go on, and compare it with one that was left alone."""
+    config, path = config_file(tmp_path, total_timesteps=1500, save_freq=600)
+    run = start("--config", path)
+    run.wait_for(300)
+    run.process.send_signal(signal.SIGSTOP)
+    time.sleep(0.5)
+    before = run.position()
+    time.sleep(seconds)
+    assert run.position() == before < 1500
+    code, _, errors = run.end(signal.SIGCONT)
+    assert code == 0, errors
+    alone = train(config.replace(output_dir=str(tmp_path / "alone")), quiet())
+    assert_same_ends(tmp_path / "runs" / "ddpg_3v1o_1", alone)
+
+
+def test_a_run_that_is_stopped_goes_on(tmp_path, start):
+    pause(1, tmp_path, start)
+
+
+@pytest.mark.slow
+def test_a_run_that_is_stopped_for_a_minute_goes_on(tmp_path, start):
+    pause(60, tmp_path, start)
+
+
+@pytest.mark.parametrize("jump", [-86_400, 30 * 86_400])
+def test_a_clock_that_jumps_changes_nothing(tmp_path, monkeypatch, jump):
+    alone = train(tiny(tmp_path / "alone"), quiet())
+    seconds, nanoseconds, ahead = time.time, time.time_ns, [0]
+    monkeypatch.setattr(time, "time", lambda: seconds() + ahead[0])
+    monkeypatch.setattr(time, "time_ns", lambda: nanoseconds() + 10**9 * ahead[0])
+
+    class Jump(BaseCallback):
+        def _on_step(self):
+            ahead[0] = jump if self.num_timesteps > 100 else 0
+            return True
+
+    jumped = train(tiny(tmp_path / "jumped"), quiet(), callbacks=[Jump()])
+    assert ahead == [jump]
+    assert_same_ends(jumped.folder, alone)
+    assert (read_curves(jumped.folder / "evaluations.npz")["seconds"] >= 0).all()
+
+
+def test_a_clock_before_1980_is_one_line_and_nothing_is_left(tmp_path, monkeypatch):
+    config = tiny(tmp_path)
+    monkeypatch.setattr(time, "localtime", lambda *_: time.gmtime(86_400))
+    with pytest.raises(SettingsError, match="clock says 1970-01-02: zip files need a date from 1980 on"):
+        train(config, quiet())
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_folder_whose_name_is_not_utf_8_is_one_line(tmp_path, start):
+    folder = os.fsdecode(bytes(tmp_path) + b"/caf\xe9")
+    code, _, errors = start("--output-dir", folder, "--total-timesteps", "10").end()
+    assert code == 2
+    assert errors == f"sb3-flock: {tmp_path}/caf?: TensorBoard needs a name in UTF-8\n"
+    assert not os.path.exists(folder)
 
 
 def test_two_trainings_never_share_a_run_folder(tmp_path, start):

@@ -4,6 +4,7 @@ import threading
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from sb3_flock.settings import RunError
 from sb3_flock.training.logger import make_logger, quiet_writer_thread
 
 STEPS = "time/total_timesteps"
@@ -54,6 +55,22 @@ def test_half_a_row_of_a_killed_run_is_dropped(tmp_path):
     log(tmp_path, 300, [(400, {"train/loss": 4.0})])
     assert [int(row[STEPS]) for row in read_csv(tmp_path)][-1] == 400
     assert "300" not in [row[STEPS] for row in read_csv(tmp_path)]
+
+
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [
+        (b"time/total_timesteps,a\n1.5,2\n", "invalid literal"),
+        (b"time/total_timesteps\xff", "can't decode"),
+        (b"x" * 200_000, "field"),
+    ],
+)
+def test_another_file_in_the_place_of_the_log_is_one_line_and_stays(tmp_path, content, why):
+    path = tmp_path / "progress.csv"
+    path.write_bytes(content)
+    with pytest.raises(RunError, match=f"progress.csv: not the log of a training .*{why}"):
+        make_logger(tmp_path, 100)
+    assert path.read_bytes() == content
 
 
 def test_a_run_from_the_start_replaces_the_rows(tmp_path):
