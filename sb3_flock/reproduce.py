@@ -48,6 +48,7 @@ class Rows:
 
 
 ROWS = (
+    Rows("paper-plain", "the paper's method without any addition"),
     Rows("ddpg", "reinforcement learning alone"),
     Rows("flock", "motion channels, imitation of an expert"),
     Rows("olfati-saber"),
@@ -63,7 +64,7 @@ SHOWN = "flock"
 ANY_SIZE = "flock"
 """The policy that is evaluated with many flock sizes."""
 
-CURVES = ("ddpg", "flock")
+CURVES = ("paper-plain", "ddpg", "flock")
 """The policies whose training curves are drawn."""
 
 FLOCK_SIZES = (1, 2, 3, 5, 8, 12, 20, 50, 200)

@@ -20,7 +20,7 @@ FILES = sorted((ROOT / "configs").glob("*.yaml"))
 SWEEPS = [path for path in FILES if path.name.startswith("sweep_")]
 TRAININGS = [path for path in FILES if path not in SWEEPS]
 HEADER = ("# For: ", "# Takes: ", "# Gives: ", "# Command: ")
-TRAINED_BY = {"ddpg": "experiment2_5v2o", "flock": "flock"}
+TRAINED_BY = {"ddpg": "experiment2_5v2o", "flock": "flock", "paper-plain": "paper_plain"}
 """The config of each shipped policy."""
 
 

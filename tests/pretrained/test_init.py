@@ -11,7 +11,7 @@ from sb3_flock.pretrained import policy_path, shipped_policies
 from sb3_flock.serialization.load import PolicyError
 from sb3_flock.settings import SettingsError
 
-NAMES = {"ddpg", "flock"}
+NAMES = {"ddpg", "flock", "paper-plain"}
 
 
 def test_the_shipped_policies_have_their_names_and_a_model_card_each():
@@ -30,13 +30,14 @@ def test_each_shipped_policy_loads_by_name_for_its_task(name, tmp_path, monkeypa
     assert 100_000 < policy.num_timesteps <= max(seed["transitions"] for seed in read_card(name)["seeds"])
     scenario = policy.scenario
     assert (scenario.n_vehicles, scenario.n_obstacles, scenario.obstacle_motion) == (5, 2, "walk")
-    assert (scenario.safety_filter, scenario.shared_detections) == ("announce", True)
+    with_filter = name != "paper-plain"
+    assert (scenario.safety_filter, scenario.shared_detections) == (("announce", True) if with_filter else ("off", False))
     assert bool(scenario.motion_lag) == (name == "flock")
     assert (policy.config.algorithm.bc_coef > 0) == (name == "flock")
     assert policy.config.train_env.expert == ("mpc" if name == "flock" else None)
 
 
-@pytest.mark.parametrize("name", ["ddpg", "flock"])
+@pytest.mark.parametrize("name", sorted(NAMES))
 @pytest.mark.parametrize("n_flocks", [1, 3])
 def test_sb3_loads_a_shipped_policy_and_learns_with_any_number_of_slots(name, n_flocks):
     env = make_vec_env(load_policy(name).scenario, n_flocks, seed=0)
@@ -48,7 +49,9 @@ def test_sb3_loads_a_shipped_policy_and_learns_with_any_number_of_slots(name, n_
 
 def test_the_path_of_a_shipped_policy():
     assert policy_path("flock") == shipped_policies()["flock"]
-    with pytest.raises(SettingsError, match=r"policy = 'flok': one of ddpg, flock is needed; did you mean flock\?"):
+    with pytest.raises(
+        SettingsError, match=r"policy = 'flok': one of ddpg, flock, paper-plain is needed; did you mean flock\?"
+    ):
         policy_path("flok")
     assert set(POLICIES.values()) == {"ddpg", "flock"}
     assert not NAMES & set(POLICIES)

@@ -3,6 +3,7 @@
 import csv
 import io
 import os
+import random
 import signal
 import subprocess
 import sys
@@ -104,17 +105,22 @@ def test_a_grid_writes_run_folders_a_table_and_a_ranking_and_survives_diverging_
 
 
 @pytest.mark.slow
-def test_a_sweep_with_a_killed_driver_resumes_to_the_same_policies(tmp_path):
-    file, out = sweep_file(tmp_path, f"base: {LONG}\ngrid: {{seed: [0, 1]}}\n"), tmp_path / "out"
-    first = Sweep(file, "--output", out)
-    first.wait_for_checkpoints(out, 2)
-    time.sleep(0.5)
-    first.process.send_signal(signal.SIGKILL)
-    first.end()
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize(("kills", "trials"), [(1, 2), (20, 8)])
+def test_a_sweep_with_a_killed_driver_resumes_to_the_same_policies(tmp_path, kills, trials):
+    file, out = sweep_file(tmp_path, f"base: {LONG}\ngrid: {{seed: {list(range(trials))}}}\n"), tmp_path / "out"
+    moments = random.Random(0)
+    for kill in range(kills):
+        sweep = Sweep("--resume", out) if kill else Sweep(file, "--output", out)
+        sweep.wait_for_checkpoints(out, min(trials, 2))
+        time.sleep(moments.uniform(0, 10) if kill else 0.5)
+        assert sweep.process.poll() is None, "the sweep ended before it could be killed"
+        sweep.process.send_signal(signal.SIGKILL)
+        sweep.end()
     assert not (out / "results.csv").exists()
     code, _, errors = Sweep("--resume", out).end()
     assert code == 0, errors
-    assert [row["status"] for row in results(out)] == ["done", "done"]
+    assert [row["status"] for row in results(out)] == ["done"] * trials
     assert_the_same_as_trained_alone(file, out, tmp_path)
     rows = results(out)
     code, _, errors = Sweep("--resume", out).end()  # nothing is left to do
