@@ -6,6 +6,7 @@ import contextlib
 import itertools
 import os
 import shlex
+import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -75,5 +76,6 @@ def describe_run(folder: Path, config: TrainingConfig, command: Sequence[str] | 
     with atomic_write(folder / "config.yaml") as temporary:
         temporary.write_text(to_yaml(config), encoding="utf-8")
     with open(folder / "command.txt", "ab") as file:
-        file.write(os.fsencode(shlex.join(command or sys.argv) + "\n"))  # a path need not be UTF-8
-    (folder / "versions.txt").write_text("".join(f"{name}=={number}\n" for name, number in versions().items()))
+        quoted = shlex.join if os.name == "posix" else subprocess.list2cmdline
+        file.write(os.fsencode(quoted(command or sys.argv) + "\n"))  # a path need not be UTF-8
+    (folder / "versions.txt").write_text("".join(f"{name}=={number}\n" for name, number in versions().items()), encoding="utf-8")

@@ -1,5 +1,4 @@
 import io
-import resource
 import subprocess
 import sys
 import zipfile
@@ -60,6 +59,7 @@ def test_what_all_members_together_unpack_to_is_bounded(tmp_path):
 
 
 def test_an_array_that_is_smaller_than_its_header_says_takes_no_memory(tmp_path):
+    resource = pytest.importorskip("resource", reason="limits of POSIX")
     content = stored(np.zeros(8)).replace(b"(8,)", b"(9999999999,)".ljust(4))
     path = npz(tmp_path / "curves.npz", {"score": content})
     code = f"from pathlib import Path; from sb3_flock.serialization.archive import read_curves; read_curves(Path({str(path)!r}))"

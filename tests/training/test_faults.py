@@ -6,7 +6,6 @@ import io
 import json
 import os
 import random
-import resource
 import shutil
 import signal
 import subprocess
@@ -30,7 +29,7 @@ from sb3_flock.settings import SettingsError
 from sb3_flock.training.checkpoint import LoadedCheckpoint
 from tests.helpers import quiet, tiny, training_state
 
-pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals and limits of POSIX")
+resource = pytest.importorskip("resource", reason="signals and limits of POSIX")
 
 LONG = {"total_timesteps": 10_000_000, "save_freq": 60, "eval_freq": 600, "n_test_episodes": 2}
 
