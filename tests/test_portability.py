@@ -27,8 +27,29 @@ sys.exit(main(sys.argv[1:]))
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="this is such a system")
 def test_training_and_evaluation_need_nothing_that_only_posix_has(tmp_path):
     words = [
-        *("train", "-f", tmp_path, "--total-timesteps", "200", "--n-flocks", "2", "--eval-freq", "100", "--save-freq", "100"),
-        *("--set", "learning_starts=40", "--set", "n_eval_episodes=2", "--set", "n_test_episodes=2", "--set", "max_cycles=20"),
+        *(
+            "train",
+            "-f",
+            tmp_path,
+            "--total-timesteps",
+            "200",
+            "--n-flocks",
+            "2",
+            "--eval-freq",
+            "100",
+            "--save-freq",
+            "100",
+        ),
+        *(
+            "--set",
+            "learning_starts=40",
+            "--set",
+            "n_eval_episodes=2",
+            "--set",
+            "n_test_episodes=2",
+            "--set",
+            "max_cycles=20",
+        ),
     ]
     command = [sys.executable, "-c", WITHOUT_POSIX, *map(str, words)]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}

@@ -78,4 +78,6 @@ def describe_run(folder: Path, config: TrainingConfig, command: Sequence[str] | 
     with open(folder / "command.txt", "ab") as file:
         quoted = shlex.join if os.name == "posix" else subprocess.list2cmdline
         file.write(os.fsencode(quoted(command or sys.argv) + "\n"))  # a path need not be UTF-8
-    (folder / "versions.txt").write_text("".join(f"{name}=={number}\n" for name, number in versions().items()), encoding="utf-8")
+    (folder / "versions.txt").write_text(
+        "".join(f"{name}=={number}\n" for name, number in versions().items()), encoding="utf-8"
+    )
