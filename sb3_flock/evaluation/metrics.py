@@ -11,7 +11,7 @@ JSON file and log.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import count
@@ -21,6 +21,7 @@ from typing import ClassVar, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_flock.settings import SettingsError, suggest
 from sb3_flock.sim import Scenario, Sensing, World
 from sb3_flock.sim.sensing import distance_blocks, is_connected, nearest
 
@@ -409,14 +410,15 @@ def is_higher_better(name: str) -> bool:
 
 
 class EpisodeMetrics:
-    """Every metric of one batch of episodes, in bounded memory.
+    """Metrics of one batch of episodes, in bounded memory.
 
     :param scenario: the task
     :param n_flocks: number of episodes in the batch
+    :param metrics: the metrics; every registered one by default
     """
 
-    def __init__(self, scenario: Scenario, n_flocks: int) -> None:
-        self._metrics = [metric(scenario, n_flocks) for metric in METRICS.values()]
+    def __init__(self, scenario: Scenario, n_flocks: int, metrics: Sequence[type[EpisodeMetric]] | None = None) -> None:
+        self._metrics = [metric(scenario, n_flocks) for metric in (METRICS.values() if metrics is None else metrics)]
         self._steps = 0
 
     def update(self, world: World, sensing: Sensing, rewards: Values) -> None:
@@ -444,15 +446,36 @@ class Metric:
     """The worst episode, for smallest distances alone."""
 
 
-def summarize(values: Mapping[str, Values]) -> dict[str, Metric]:
+def find_metrics(metrics: Sequence[str | type[EpisodeMetric]] | None) -> list[type[EpisodeMetric]]:
+    """Metrics by their names or classes; ``None`` stands for every registered one.
+
+    :raises SettingsError: for a name that is not registered, something else than a class, or two of one name
+    """
+    found = []
+    for each in METRICS if metrics is None else metrics:
+        metric = METRICS.get(each) if isinstance(each, str) else each
+        if metric is None:
+            raise SettingsError(f"metrics = {each!r}: one of {', '.join(METRICS)} is needed{suggest(str(each), METRICS)}")
+        if not (isinstance(metric, type) and issubclass(metric, EpisodeMetric)):
+            raise SettingsError(f"metrics: {each!r} is neither a name nor a subclass of EpisodeMetric")
+        found.append(metric)
+    names = [each.name for each in found]
+    twice = [name for name in names if names.count(name) > 1]
+    if twice:
+        raise SettingsError(f"metrics: {twice[0]} is named twice")
+    return found
+
+
+def summarize(values: Mapping[str, Values], metrics: Mapping[str, type[EpisodeMetric]] = METRICS) -> dict[str, Metric]:
     """Unweighted means over episodes, with 95 % intervals.
 
     Metrics that are 0 or 1 in each episode (:attr:`EpisodeMetric.is_binary`) have Wilson's score interval, the others the
     percentile bootstrap over episodes (10 000 resamples), which would have no width where all episodes are alike.
 
     :param values: one value per episode for each metric, NaN where undefined
+    :param metrics: the metrics' classes by name
     """
-    return {name: _summarize(METRICS[name], per_episode[~np.isnan(per_episode)]) for name, per_episode in values.items()}
+    return {name: _summarize(metrics[name], per_episode[~np.isnan(per_episode)]) for name, per_episode in values.items()}
 
 
 def _summarize(metric: type[EpisodeMetric], defined: Values) -> Metric:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sb3_flock._renamed import warn_renamed
 from sb3_flock.controllers import Controller
 from sb3_flock.controllers.policy import PolicyController
-from sb3_flock.evaluation.metrics import EpisodeMetrics, Metric, summarize
+from sb3_flock.evaluation.metrics import EpisodeMetric, EpisodeMetrics, Metric, find_metrics, summarize
 from sb3_flock.settings import SettingsError, check_integer
 from sb3_flock.sim import Scenario, Sensing, World, episode_rng, own_reward, reward_terms
 
@@ -27,11 +27,13 @@ def rollout(
     seed: int,
     batch: int = BATCH,
     watch: Callable[[World], None] = lambda world: None,
+    metrics: Sequence[type[EpisodeMetric]] | None = None,
 ) -> dict[str, NDArray[np.float64]]:
     """Simulate episodes 0 ... ``episodes - 1`` of a seed.
 
     :param batch: episodes simulated at once; it does not change the results
     :param watch: called with the world of the first batch at the start and after each step
+    :param metrics: what is measured; every registered metric by default
     :return: each metric's value for each episode, ``(episodes,)``
     :raises SettingsError: for counts that are not accepted
     """
@@ -40,7 +42,9 @@ def rollout(
     results = []
     for start in range(0, episodes, batch):
         rngs = [episode_rng(seed, episode) for episode in range(start, min(start + batch, episodes))]
-        results.append(rollout_batch(lambda world: controller, scenario, rngs, *([] if start else [watch])))
+        results.append(
+            rollout_batch(lambda world: controller, scenario, rngs, **({} if start else {"watch": watch}), metrics=metrics)
+        )
     return {name: np.concatenate([result[name] for result in results]) for name in results[0]}
 
 
@@ -49,22 +53,24 @@ def rollout_batch(
     scenario: Scenario,
     rngs: Sequence[np.random.Generator],
     watch: Callable[[World], None] = lambda world: None,
+    metrics: Sequence[type[EpisodeMetric]] | None = None,
 ) -> dict[str, NDArray[np.float64]]:
     """Simulate a batch of episodes in lockstep.
 
     :param make_controller: makes the controller of a world; a privileged one may read the whole world
     :param rngs: one generator per episode
     :param watch: called with the world at the start and after each step
+    :param metrics: what is measured; every registered metric by default
     :return: each metric's value for each episode, ``(episodes,)``
     """
-    metrics = EpisodeMetrics(scenario, len(rngs))
+    measured = EpisodeMetrics(scenario, len(rngs), metrics)
     world, sensing, controller = _start(make_controller, scenario, rngs)
     watch(world)
     for _ in range(scenario.max_cycles):
         sensing, executed = world.step(controller.act(world.sensors.measure(sensing), scenario))
-        metrics.update(world, sensing, own_reward(reward_terms(sensing, executed, scenario.reward, scenario)))
+        measured.update(world, sensing, own_reward(reward_terms(sensing, executed, scenario.reward, scenario)))
         watch(world)
-    return metrics.result()
+    return measured.result()
 
 
 def iter_rollout(policy: Any, scenario: Scenario, seed: int = 0, episode: int = 0) -> Iterator[World]:
@@ -127,18 +133,26 @@ class _Adapter(Controller):
 
 
 def evaluate(
-    policy: Any, scenario: Scenario | None = None, episodes: int = 1000, seed: int = 0, batch: int = BATCH
+    policy: Any,
+    scenario: Scenario | None = None,
+    episodes: int = 1000,
+    seed: int = 0,
+    batch: int = BATCH,
+    metrics: Sequence[str | type[EpisodeMetric]] | None = None,
 ) -> dict[str, Metric]:
     """Evaluate a policy or any other controller.
 
     It warns where the scenario has a safety filter that guarantees nothing, and names what ends the guarantee.
 
-    :param policy: a :class:`Controller`, or anything with SB3's ``predict``
+    :param policy: a :class:`Controller`, or anything with SB3's ``predict``: a model of any algorithm, recurrent or not, whose
+        env ``VecNormalize`` and ``VecFrameStack`` may wrap
     :param scenario: the task; the default is the one a loaded policy was trained for
     :param episodes: number of episodes
     :param seed: episode e draws from ``SeedSequence([seed, e])``
-    :return: every metric of :data:`~sb3_flock.evaluation.METRICS` by name
-    :raises SettingsError: for counts that are not accepted, or without a scenario
+    :param metrics: what is measured, by name or as classes, registered or not; by default every metric of
+        :data:`~sb3_flock.evaluation.METRICS`
+    :return: the metrics by name
+    :raises SettingsError: for counts or metrics that are not accepted, or without a scenario
     :raises PolicyError: if a loaded policy's observations differ in shape; it warns where they have another meaning
     """
     scenario = scenario or getattr(policy, "scenario", None)
@@ -148,4 +162,6 @@ def evaluate(
         warnings.warn(
             f"the safety filter guarantees no separation with {', '.join(scenario.guarantee_limits)}", stacklevel=2
         )
-    return summarize(rollout(as_controller(policy, scenario), scenario, episodes, seed, batch))
+    kinds = find_metrics(metrics)
+    values = rollout(as_controller(policy, scenario), scenario, episodes, seed, batch, metrics=kinds)
+    return summarize(values, {kind.name: kind for kind in kinds})

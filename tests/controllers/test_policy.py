@@ -1,8 +1,10 @@
+import functools
+
 import numpy as np
 import pytest
 from sb3_contrib import RecurrentPPO
 from stable_baselines3 import DDPG
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
 from sb3_flock import FlockPolicy, Scenario, make_vec_env
 from sb3_flock.controllers.policy import PolicyController
@@ -103,3 +105,25 @@ def test_a_model_with_vec_normalize_sees_normalized_observations():
         actions = PolicyController(model).act(copy.world.sense(), SCENARIO)
         expected, _ = model.predict(observations[start : start + 5], deterministic=True)
         np.testing.assert_allclose(actions[0], expected, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("order", ["normalize first", "stack first"])
+def test_a_model_with_a_stack_of_frames_acts_as_in_sb3s_loop(order):
+    flat = make_vec_env(SCENARIO, 2, seed=0)
+    stack = functools.partial(VecFrameStack, n_stack=3, channels_order="first")
+    env = stack(VecNormalize(flat)) if order == "normalize first" else VecNormalize(stack(flat))
+    model = DDPG(FlockPolicy, env, buffer_size=20, device="cpu", policy_kwargs={"final_init": 1.0}, seed=0)
+    controller, observations = PolicyController(model), model.env.reset()
+    for step in range(5):
+        sensing = env.get_attr("unwrapped", indices=[5])[0].world.sense()
+        model.get_vec_normalize_env().training = False
+        expected, _ = model.predict(observations, deterministic=True)
+        if step == 3:  # another controller goes on from its state
+            other = PolicyController(model)
+            other.load_state_dict(controller.state_dict())
+            controller = other
+        np.testing.assert_allclose(controller.act(sensing, SCENARIO)[0], expected[5:], rtol=1e-4, atol=1e-6)
+        observations, *_ = model.env.step(expected)
+    controller.reset([], SCENARIO)
+    again = controller.act(sensing, SCENARIO)[0]
+    assert np.abs(again - expected[5:]).max() > 1e-4  # without the earlier frames

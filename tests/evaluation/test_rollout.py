@@ -6,6 +6,7 @@ from sb3_flock.controllers import Controller, make_controller
 from sb3_flock.controllers.policy import PolicyController
 from sb3_flock.envs.flocking_v0 import action_space, observation_space
 from sb3_flock.evaluation import METRICS, rollout
+from sb3_flock.evaluation.metrics import EpisodeMetric
 from sb3_flock.evaluation.rollout import as_controller, iter_rollout, rollout_batch
 from sb3_flock.serialization.load import PolicyError, load_policy
 from sb3_flock.settings import ActionError, SettingsError
@@ -179,3 +180,41 @@ def test_a_controller_is_reset_before_each_batch():
     controller = Recorder()
     rollout(controller, SCENARIO, 5, seed=0, batch=2)
     assert controller.resets == [(2, SCENARIO), (2, SCENARIO), (1, SCENARIO)]
+
+
+class Farthest(EpisodeMetric):
+    """Largest distance of a vehicle to the waypoint in the episode; registered nowhere."""
+
+    name, unit, better, description = "farthest", "m", "lower", "largest distance of a vehicle to the waypoint"
+
+    def __init__(self, scenario, n_flocks):
+        super().__init__(scenario, n_flocks)
+        self._largest = np.zeros(n_flocks)
+
+    def update(self, step):
+        self._largest = np.maximum(self._largest, step.sensing.waypoint_distances.max(-1))
+
+    def result(self):
+        return self._largest
+
+
+def test_metrics_are_chosen_by_name_or_class():
+    scenario = Scenario(max_cycles=10)
+    chosen = evaluate(make_controller("random"), scenario, 3, metrics=["connectivity", Farthest])
+    assert list(chosen) == ["connectivity", "farthest"]
+    assert chosen["connectivity"] == evaluate(make_controller("random"), scenario, 3)["connectivity"]
+    assert chosen["farthest"].mean > 0.5
+    assert "farthest" not in METRICS
+
+
+@pytest.mark.parametrize(
+    ("metrics", "message"),
+    [
+        (["conectivity"], "metrics = 'conectivity': one of .*; did you mean connectivity"),
+        ([dict], "metrics: .*dict.* is neither a name nor a subclass of EpisodeMetric"),
+        (["return", METRICS["return"]], "metrics: return is named twice"),
+    ],
+)
+def test_metrics_that_cannot_be_are_refused(metrics, message):
+    with pytest.raises(SettingsError, match=message):
+        evaluate(make_controller("random"), Scenario(max_cycles=10), 1, metrics=metrics)
