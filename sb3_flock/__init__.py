@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from sb3_flock.deploy.onnx_export import export
     from sb3_flock.envs import flocking_v0
     from sb3_flock.envs.expert_env import ExpertEnv
+    from sb3_flock.envs.groups import flatten_groups, learn_groups
     from sb3_flock.envs.vec_env import flatten, make_vec_env
     from sb3_flock.envs.vec_reward import VecNeighborInclusiveReward
     from sb3_flock.evaluation import evaluate, register_metric
@@ -68,7 +69,9 @@ __all__ = [
     "export",
     "export_c",
     "flatten",
+    "flatten_groups",
     "flocking_v0",
+    "learn_groups",
     "load_policy",
     "make_controller",
     "make_vec_env",
@@ -107,6 +110,8 @@ _HOMES = {
     "export": "deploy.onnx_export",
     "export_c": "deploy.c_export",
     "flatten": "envs.vec_env",
+    "flatten_groups": "envs.groups",
+    "learn_groups": "envs.groups",
     "load_policy": "serialization.load",
     "make_controller": "controllers",
     "make_vec_env": "envs.vec_env",

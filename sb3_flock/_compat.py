@@ -68,7 +68,7 @@ def set_counters(model: OffPolicyAlgorithm, values: Mapping[str, Any]) -> None:
         setattr(model, name, values[name])
 
 
-def last_observations(model: OffPolicyAlgorithm) -> Any:
+def last_observations(model: BaseAlgorithm) -> Any:
     """The observations from which the next actions are computed, ``(slots, *shape)``."""
     return model._last_obs
 

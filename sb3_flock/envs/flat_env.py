@@ -61,6 +61,13 @@ class FlatEnv(MarkovVectorEnv):
             raise RunError("the env has no agents after its reset")
         return result
 
+    def is_over(self, ended: set[str]) -> bool:
+        """Whether no agent is left.
+
+        :param ended: the agents that ended in the last step
+        """
+        return set(self.par_env.agents) <= ended
+
     def step(
         self, actions: Any
     ) -> tuple[Any, NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_], list[dict[str, Any]]]:
@@ -83,7 +90,7 @@ class FlatEnv(MarkovVectorEnv):
         ends = np.flatnonzero(terminations | truncations).tolist()
         for slot in ends:
             infos[slot]["terminal_observation"] = copy.deepcopy(observations.get(names[slot], self._nothing))
-        if left <= {names[slot] for slot in ends}:
+        if self.is_over({names[slot] for slot in ends}):
             next_observations, reset_infos = self.reset()
             for info, reset_info in zip(infos, reset_infos, strict=True):
                 info[RESET_INFO] = reset_info
