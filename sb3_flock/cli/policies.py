@@ -120,6 +120,10 @@ def _print_card(name: str, console: Any) -> None:
         which = "Results" if number == 1 else f"Medians of the {number} trainings"
         console.print(f"{which} on {card['episodes']} episodes of each task, with the same filter:")
         console.print(_results_of_tasks(card))
+    if "robustness" in card:
+        episodes = card["robustness"]["episodes"]
+        console.print(f"What the policy bears, {episodes} episodes of the task each (`sb3-flock evaluate {name} --robustness`):")
+        console.print(_robustness(card))
 
 
 def _facts(name: str, card: Mapping[str, Any]) -> dict[str, str]:
@@ -172,3 +176,14 @@ def _results_of_tasks(card: Mapping[str, Any]) -> Table:
     for task in _shipped(card)["tasks"]:
         table.add_row(task, *short_cells({metric: over.mean for metric, over in over_seeds(card, task).items()}))
     return table
+
+
+def _robustness(card: Mapping[str, Any]) -> Table:
+    """A line for each sensor error and each change of the dynamics."""
+    from sb3_flock.evaluation.metrics import Metric
+    from sb3_flock.evaluation.robustness import errors_table
+
+    rows, episodes = card["robustness"]["conditions"], card["robustness"]["episodes"]
+    return errors_table(
+        {name: {key: Metric(mean, None, None, episodes) for key, mean in row.items()} for name, row in rows.items()}
+    )

@@ -10,21 +10,28 @@ import json
 import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sb3_flock.config.training import TrainingConfig
-from sb3_flock.evaluation.metrics import Metric
+from sb3_flock.evaluation.metrics import Metric, columns
+from sb3_flock.evaluation.robustness import evaluate_robustness
 from sb3_flock.evaluation.rollout import evaluate
 from sb3_flock.evaluation.tasks import TASKS, with_bodies_of
 from sb3_flock.pretrained import shipped_policies
 from sb3_flock.serialization.migrate import FORMAT, MEMBER
 from sb3_flock.sim import Scenario
 
+if TYPE_CHECKING:
+    from sb3_flock.serialization.load import LoadedPolicy
+
 CHECK_EPISODES, CHECK_SEED = 50, 7
 """The short evaluation whose tracking error a card records. The tests repeat it with every later version."""
+
+ROBUSTNESS_EPISODES = 250
+"""Episodes under each of the conditions that a card says what its policy bears in."""
 
 
 def read_card(name: str) -> dict[str, Any]:
@@ -77,6 +84,7 @@ def ship(name: str, runs: Sequence[str | Path], folder: str | Path, episodes: in
         "check": {"episodes": CHECK_EPISODES, "seed": CHECK_SEED, "tracking_error": check},
         "versions": shipped.versions,
         "seeds": records,
+        "robustness": _robustness(shipped, ROBUSTNESS_EPISODES),
         "config": shipped.config.model_dump(mode="json"),
     }
     (folder / f"{name}.json").write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
@@ -102,6 +110,14 @@ def _record(run: Path, history: Mapping[str, NDArray[np.float64]], episodes: int
         "tasks": {name: metrics[scenario] for name, scenario in tasks.items()},
         "curve": {key: history[key].round(4).tolist() for key in ("timesteps", "return", "tracking_error")},
     }
+
+
+def _robustness(policy: LoadedPolicy, episodes: int) -> dict[str, Any]:
+    """What the policy bears: the metrics of narrow tables under each of the conditions of ``evaluate --robustness``."""
+    rows = evaluate_robustness(policy, policy.scenario, episodes)
+    means = {name: {key: row[key].mean for key in columns()} for name, row in rows.items()}
+    rounded = {name: {key: mean and round(mean, 5) for key, mean in row.items()} for name, row in means.items()}
+    return {"episodes": episodes, "conditions": rounded}
 
 
 def _copy_light(source: Path, target: Path) -> None:
