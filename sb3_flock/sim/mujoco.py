@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sb3_flock.settings import RunError
 from sb3_flock.sim.actuators import follow
 from sb3_flock.sim.randomization import FlockValues
 from sb3_flock.sim.simulators import Simulator, import_extra, register_simulator
@@ -34,6 +35,7 @@ class MuJoCo(Simulator):
     wheels on the floor moves the vehicle. One physical model serves all flocks, each has its own state.
 
     :raises SettingsError: without the extra ``mujoco``
+    :raises RunError: in a step, if the simulation is unstable
     """
 
     period = DRIVE_PERIOD
@@ -71,6 +73,8 @@ class MuJoCo(Simulator):
             for state, rates in zip(self._states, wheels, strict=True):
                 state.ctrl[:] = rates.ravel()
                 self._mujoco.mj_step(self._model, state, round(DRIVE_PERIOD / PERIOD))
+        if any(state.warning.number.any() for state in self._states):  # MuJoCo goes on, with a state that it resets
+            raise RunError("mujoco: the simulation is unstable, or too many bodies touch")
         bodies = self._bodies("qpos")
         w, x, y, z = np.moveaxis(bodies[..., 3:7], -1, 0)
         self._headings = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))

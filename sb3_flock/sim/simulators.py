@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import importlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
@@ -68,16 +68,21 @@ class Simulator(ABC):
 class SimulatorDynamics(VehicleDynamics):
     """The vehicles move as in the registered simulator that ``settings.dynamics`` names.
 
-    The simulator is placed anew wherever the poses are not those that it returned last. Its own state is in no checkpoint.
+    The simulator is reset wherever the poses are not those that it returned last. Its own state is in no checkpoint.
     ``actuators.speed_lag`` and ``actuators.max_acceleration`` are what the safety filter assumes of the vehicles.
 
     :raises SettingsError: for actuators that the simulator does not simulate, or a time step that is no multiple of its own
     """
 
+    memory = ("speeds",)
+    speeds: NDArray[np.float64]
+    """Actual speeds, ``(flocks, vehicles)`` [m/s]."""
+
     def __init__(self, settings: DynamicsSettings) -> None:
         super().__init__(settings)
         self._class = SIMULATORS[settings.dynamics]
         self._simulator: Simulator | None = None
+        self._poses: NDArray[np.float64] | None = None
         for name in Actuators.model_fields:
             if self.actuators.is_on(name) and name not in self._class.actuators:
                 simulated = ", ".join(self._class.actuators) or "none"
@@ -98,10 +103,9 @@ class SimulatorDynamics(VehicleDynamics):
             raise SettingsError(
                 f"randomization: the simulator {self.settings.dynamics} has the same actuators in all flocks"
             )
-        if self._simulator is None or self._simulator.n_flocks != len(rngs):
-            self._simulator = self._class(self.settings, len(rngs))
-        self._poses: NDArray[np.float64] | None = None
-        self._speeds = np.zeros((len(rngs), self.settings.n_vehicles))
+        self._simulator_of(len(rngs))
+        self._poses = None
+        self.speeds = np.zeros((len(rngs), self.settings.n_vehicles))
 
     def step(
         self,
@@ -111,27 +115,37 @@ class SimulatorDynamics(VehicleDynamics):
         dt: float,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Move every vehicle by one sampling period; see the class."""
-        assert self._simulator is not None
+        simulator = self._simulator_of(len(positions))
         before = np.concatenate((positions, headings[..., None]), axis=-1)
         if self._poses is None or not np.array_equal(before, self._poses):
-            self._simulator.reset(before)
-        after = np.array(self._simulator.step(commands), dtype=np.float64)
+            simulator.reset(before)
+        after = np.array(simulator.step(commands), dtype=np.float64)
         if after.shape != before.shape:
             raise ValueError(
                 f"dynamics = {self.settings.dynamics}: its step returns poses of shape {after.shape}: {before.shape} is needed"
             )
         after[..., 2] = wrap_angle(after[..., 2])
-        self._poses = after
-        speeds = self._simulator.speeds()
+        self._poses = after.copy()
+        speeds = simulator.speeds()
         if speeds is None:
             halfway = before[..., 2] + wrap_angle(after[..., 2] - before[..., 2]) / 2
             speeds = ((after - before)[..., :2] * directions_of(halfway)).sum(-1) / dt
-        self._speeds = np.maximum(speeds, 0.0)
+        self.speeds = np.maximum(speeds, 0.0)
         return after[..., :2], after[..., 2]
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore :meth:`state_dict`; the simulator is reset at the next step, in which the vehicles start at rest."""
+        super().load_state_dict(state)
+        self._poses = None
+
+    def _simulator_of(self, n_flocks: int) -> Simulator:
+        if self._simulator is None or self._simulator.n_flocks != n_flocks:
+            self._simulator = self._class(self.settings, n_flocks)
+        return self._simulator
 
     def stopping(self) -> Stopping:
         """The actual speeds, and what ``actuators`` says of lag and acceleration."""
-        return Stopping(self._speeds, self.actuators.speed_lag, self.actuators.max_acceleration)
+        return Stopping(self.speeds, self.actuators.speed_lag, self.actuators.max_acceleration)
 
 
 SIMULATORS: dict[str, type[Simulator]] = {}

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from sb3_flock.settings import RunError
 from sb3_flock.sim import Scenario
 from sb3_flock.sim.mujoco import MuJoCo
 from tests.sim.simulator_contract import SimulatorContract, simulate
@@ -51,6 +52,15 @@ def test_many_vehicles_in_contact_stay_finite():
     _, poses = simulate("mujoco", starts, [(0.15, 1.0)] * 5)
     assert np.isfinite(poses).all()
     assert np.abs(poses[-1, :, :2] - np.array(starts)[:, :2]).max() < 0.1
+
+
+def test_an_unstable_simulation_ends_in_one_line(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes a log
+    simulator = MuJoCo(Scenario(n_vehicles=1), 1)
+    simulator.reset(np.zeros((1, 1, 3)))
+    simulator._states[0].qvel[0] = np.nan
+    with pytest.raises(RunError, match="mujoco: the simulation is unstable"):
+        simulator.step(np.zeros((1, 1, 2)))
 
 
 def test_flocks_do_not_meet_each_other():

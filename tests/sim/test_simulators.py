@@ -63,8 +63,8 @@ def test_the_world_has_the_simulators_poses_and_resets_it_where_they_are_changed
     np.testing.assert_allclose(world.headings[0], [0.05, 3.2 - 2 * np.pi])
     world.step(executed)
     assert simulator.resets == 1
-    world.positions = world.positions + 0.2
-    before = world.positions
+    world.positions += 0.2
+    before = world.positions.copy()
     world.step(np.zeros((1, 2, 2)))
     assert simulator.resets == 2
     np.testing.assert_array_equal(world.positions, before)
@@ -72,6 +72,17 @@ def test_the_world_has_the_simulators_poses_and_resets_it_where_they_are_changed
     world.step(np.zeros((1, 2, 2)))
     assert world.dynamics._simulator is simulator
     assert simulator.resets == 3
+
+
+def test_a_restored_state_continues_from_its_poses_at_rest(registered):
+    registered()
+    scenario = Scenario(dynamics="fake", actuators={"max_acceleration": 0.4})
+    world, other = place(scenario, [(0, 0), (0.5, 0)], [0, 1]), World(scenario.replace(n_vehicles=2, n_obstacles=0))
+    world.step([[(0.15, 0.0), (0.0, 1.0)]])
+    other.load_state_dict(world.state_dict())
+    np.testing.assert_array_equal(other.dynamics.stopping().speeds, world.dynamics.stopping().speeds)
+    other.step(np.zeros((1, 2, 2)))
+    np.testing.assert_array_equal(other.positions, world.positions)
 
 
 def test_the_filter_has_the_mean_speed_of_a_step_or_the_simulators_own(registered):
