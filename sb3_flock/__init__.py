@@ -37,11 +37,13 @@ if TYPE_CHECKING:
     from sb3_flock.sim import (
         RewardWeights,
         Scenario,
+        Simulator,
         VehicleDynamics,
         World,
         register_channel,
         register_dynamics,
         register_reward_term,
+        register_simulator,
     )
     from sb3_flock.training.eval_callback import FlockEvalCallback
     from sb3_flock.training.train import resume, train
@@ -61,6 +63,7 @@ __all__ = [
     "NeighborInclusiveReward",
     "RewardWeights",
     "Scenario",
+    "Simulator",
     "TrainingConfig",
     "VecNeighborInclusiveReward",
     "VehicleDynamics",
@@ -82,6 +85,7 @@ __all__ = [
     "register_dynamics",
     "register_metric",
     "register_reward_term",
+    "register_simulator",
     "render",
     "resume",
     "save_model",
@@ -102,6 +106,7 @@ _HOMES = {
     "NeighborInclusiveReward": "rl.callbacks",
     "RewardWeights": "sim",
     "Scenario": "sim",
+    "Simulator": "sim",
     "TrainingConfig": "config.training",
     "VecNeighborInclusiveReward": "envs.vec_reward",
     "VehicleDynamics": "sim",
@@ -122,6 +127,7 @@ _HOMES = {
     "register_dynamics": "sim",
     "register_metric": "evaluation",
     "register_reward_term": "sim",
+    "register_simulator": "sim",
     "render": "viz.video",
     "resume": "training.train",
     "save_model": "serialization.save",

@@ -128,6 +128,15 @@ def test_dynamics_of_ones_own_train_evaluate_and_render(tmp_path):
     assert (tmp_path / "extend_dynamics.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_a_simulator_of_ones_own_evaluates_and_renders(tmp_path):
+    output = run("simulator", 20, cwd=tmp_path)
+    errors = {name: float(error) for name, error in re.findall(r"(\S+): tracking error ([\d.]+) m", output)}
+    assert list(errors) == ["robots", "unicycle"]
+    assert errors["robots"] != errors["unicycle"]
+    assert abs(errors["robots"] - errors["unicycle"]) < 0.01
+    assert (tmp_path / "extend_simulator.png").read_bytes().startswith(b"\x89PNG")
+
+
 @pytest.mark.parametrize("path", sorted((ROOT / "examples").glob("extend_*.py")), ids=lambda path: path.stem)
 def test_every_example_is_short_and_on_a_page_of_its_own(path):
     code = [line for line in path.read_text().splitlines() if line.strip()]

@@ -32,10 +32,13 @@ def add(parser: Parser) -> None:
 def run(options: argparse.Namespace, words: Sequence[str]) -> int:
     """Evaluate, print, and write JSON where asked for."""
     from sb3_flock.console import PlainConsole
+    from sb3_flock.sim.simulators import SIMULATORS
 
     if options.output is not None and not Path(options.output).absolute().parent.is_dir():
         raise SettingsError(f"--output {options.output}: there is no folder {Path(options.output).parent}")
     controller, name, scenario = shared.rollout_of(options)
+    if options.robustness and scenario.dynamics in SIMULATORS:
+        raise SettingsError(f"--robustness: the simulator {scenario.dynamics} has dynamics of its own, which are not varied")
     console = PlainConsole(stderr=True)
     metrics = shared.evaluate_and_print(controller, name, scenario, options.episodes, options.seed, console)
     if options.robustness:

@@ -37,12 +37,14 @@ def add_rollout(parser: Parser) -> None:
     """Which controller, in which scenario: the same for every command that simulates."""
     from sb3_flock.controllers import CONTROLLERS
     from sb3_flock.sim import Scenario
+    from sb3_flock.sim.simulators import SIMULATORS
 
     parser.add_argument("policy", nargs="?", metavar="POLICY", help=POLICY_HELP)
     parser.add_argument("--controller", metavar="NAME", help=f"a baseline controller instead: {listed(CONTROLLERS)}")
     parser.add_argument("--n-vehicles", metavar="N", type=whole_number, help="number of vehicles [as trained]")
     parser.add_argument("--n-obstacles", metavar="N", type=whole_number, help="number of obstacles [as trained]")
     parser.add_argument("--obstacle-motion", metavar="NAME", help="walk or crossing [as trained]")
+    parser.add_argument("--simulator", metavar="NAME", help=f"move the vehicles in another simulator: {listed(SIMULATORS)}")
     parser.add_argument("--seed", type=count(0), default=0, metavar="N", help="seed of the episodes [0]")
     parser.add_argument("--device", default="cpu", metavar="NAME", help="torch device [cpu]")
     add_trust(parser)
@@ -56,7 +58,9 @@ ROLLOUT_RENAMED = {"--scenario": "--obstacle-motion"}
 def rollout_of(options: argparse.Namespace) -> tuple[Any, str, Any]:
     """The policy or controller, its name, and the scenario."""
     from sb3_flock.serialization.yaml_io import load_config
+    from sb3_flock.settings import suggest
     from sb3_flock.sim import Scenario
+    from sb3_flock.sim.simulators import SIMULATORS
 
     if (options.policy is None) == (options.controller is None):
         raise SettingsError(f"{options.command}: a POLICY or --controller NAME is needed, and not both")
@@ -71,6 +75,11 @@ def rollout_of(options: argparse.Namespace) -> tuple[Any, str, Any]:
     overrides = overrides_of(options.set)
     flags = ("n_vehicles", "n_obstacles", "obstacle_motion")
     overrides.update({key: value for key in flags if (value := getattr(options, key)) is not None})
+    if options.simulator is not None:
+        if options.simulator not in SIMULATORS:
+            known = f"one of {listed(SIMULATORS)} is needed{suggest(options.simulator, SIMULATORS)}"
+            raise SettingsError(f"--simulator {options.simulator}: {known}")
+        overrides["dynamics"] = options.simulator
     return controller, name, load_config(Scenario, overrides=overrides, base=trained_for)
 
 

@@ -18,6 +18,7 @@ from sb3_flock.sim.actuators import Actuators
 from sb3_flock.sim.dynamics import MAX_BODIES, ObstacleMotion
 from sb3_flock.sim.randomization import check_ranges
 from sb3_flock.sim.sensors import SensorErrors
+from sb3_flock.sim.simulators import SIMULATORS
 from sb3_flock.sim.world import check_randomization
 
 TRAINING_TASK: dict[str, Any] = {"safety_filter": "announce", "shared_detections": True}
@@ -119,6 +120,15 @@ class TaskConfig(Settings):
     @model_validator(mode="after")
     def _ranges_fit_the_task(self) -> TaskConfig:
         check_randomization(self.train_env.randomization, self.scenario)
+        return self
+
+    @model_validator(mode="after")
+    def _no_simulator_trains(self) -> TaskConfig:
+        if self.scenario.dynamics in SIMULATORS:
+            raise ValueError(
+                f"scenario.dynamics = {self.scenario.dynamics}: the state of a simulator is in no checkpoint; simulators "
+                "evaluate, render and play"
+            )
         return self
 
     @model_validator(mode="after")

@@ -8,6 +8,7 @@ from sb3_flock.sim.observation import Channel, observe, register_channel
 from sb3_flock.sim.reward import RewardWeights, mix_rewards, own_reward, register_reward_term, reward_terms
 from sb3_flock.sim.scenario import Scenario
 from sb3_flock.sim.sensing import Contacts, Sensing
+from sb3_flock.sim.simulators import Simulator, register_simulator
 from sb3_flock.sim.world import World, check_actions, episode_rng
 
 __all__ = [
@@ -16,6 +17,7 @@ __all__ = [
     "RewardWeights",
     "Scenario",
     "Sensing",
+    "Simulator",
     "VehicleDynamics",
     "World",
     "check_actions",
@@ -26,6 +28,7 @@ __all__ = [
     "register_channel",
     "register_dynamics",
     "register_reward_term",
+    "register_simulator",
     "reward_terms",
 ]
 

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from sb3_flock.settings import ActionError, Coordinate, NotNegative, Positive, SettingsError, UserError
-from sb3_flock.sim import dynamics
+from sb3_flock.sim import dynamics, mujoco, navground  # noqa: F401 - the last two register simulators
 from sb3_flock.sim.backend import compiled
 from sb3_flock.sim.dynamics import DYNAMICS, VehicleDynamics, directions_of, wrap_angle
 from sb3_flock.sim.randomization import FlockValues, Ranges, check_ranges, draw

@@ -61,6 +61,8 @@ def test_a_policys_old_name_works_with_one_line(capsys, monkeypatch):
         (["--set", "n_anchors=9"], ["(3, 11, 11)", "n_anchors = 9"]),
         (["--set", "speed=9"], ["speed is not a parameter"]),
         (["--device", "abacus"], ["device"]),
+        (["--simulator", "mujocco"], ["--simulator mujocco: one of mujoco, navground is needed; did you mean mujoco?"]),
+        (["--simulator", "mujoco", "--robustness"], ["--robustness: the simulator mujoco has dynamics of its own"]),
     ],
 )
 def test_a_users_mistake_is_one_line_and_exit_code_2(run_folder, extra, expected, fails):

@@ -12,7 +12,7 @@ from sb3_flock.sim import Scenario
 def options(**given):
     values = {
         "command": "evaluate", "policy": None, "controller": None, "n_vehicles": None, "n_obstacles": None,
-        "obstacle_motion": None, "device": "cpu", "trust": False, "set": [],
+        "obstacle_motion": None, "simulator": None, "device": "cpu", "trust": False, "set": [],
     }  # fmt: skip
     return argparse.Namespace(**{**values, **given})
 

@@ -107,7 +107,8 @@ def test_a_vector_env_continues_from_its_state(drifting):
 
 def test_an_unknown_name_is_refused_with_the_nearest(drifting):
     with pytest.raises(
-        SettingsError, match=r"dynamics = driftin: .*registered are unicycle, drifting; did you mean drifting\?"
+        SettingsError,
+        match=r"dynamics = driftin: .*registered are mujoco, navground, unicycle, drifting; did you mean drifting\?",
     ):
         Scenario(dynamics="driftin")
 
