@@ -130,7 +130,7 @@ def filter_actions(
     observers, strides, budgets = np.empty(0, np.int64), np.empty(0), np.empty(0)
     neighbors, obstacles = sensing.neighbors, sensing.obstacles
     if settings.safety_filter != "off":
-        gaps = np.maximum(neighbors.distances - settings.neighbor_separation - margin, 0.0)
+        gaps = np.maximum(neighbors.distances - settings.neighbor_separation - margin - _uncertain(neighbors, settings), 0.0)
         receding = _receding(sensing, settings, frames)
         observers, strides = neighbors.observers, _cosines(neighbors) * dt
         budgets = np.where(receding >= 0, gaps, gaps / 2)
@@ -138,7 +138,8 @@ def filter_actions(
         kept = settings.obstacle_separation + margin + settings.obstacle_max_speed * dt
         observers = np.concatenate((observers, obstacles.observers))
         strides = np.concatenate((strides, _cosines(obstacles) * dt))
-        budgets = np.concatenate((budgets, np.maximum(obstacles.distances - kept, 0.0)))
+        gaps_of_obstacles = obstacles.distances - kept - _uncertain(obstacles, settings)
+        budgets = np.concatenate((budgets, np.maximum(gaps_of_obstacles, 0.0)))
     rounding = ROUNDING * (margin + max(settings.neighbor_separation, settings.obstacle_separation))
     asked = actions[..., 0].ravel()
 
@@ -215,6 +216,11 @@ def limit_speeds(
     over = np.flatnonzero(strides * limited[observers] > budgets - rounding)
     limited[observers[over]] = floors[observers[over]]
     return limited
+
+
+def _uncertain(contacts: Contacts, settings: SafetySettings) -> NDArray[np.float64] | float:
+    """What is kept for the uncertainty of estimated positions, ``(contacts,)`` [m]; 0 for measured ones."""
+    return 0.0 if contacts.stds is None else settings.tracker.margin_stds * contacts.stds
 
 
 def _cosines(contacts: Contacts) -> NDArray[np.float64]:

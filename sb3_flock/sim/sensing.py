@@ -64,6 +64,8 @@ class Contacts:
     """``(contacts, 2)`` [m], of the body in the observer's frame: forward is +x, left is +y."""
     distances: NDArray[np.float64]
     """``(contacts,)`` [m]."""
+    stds: NDArray[np.float64] | None = None
+    """Standard deviation of each coordinate of an estimated position, ``(contacts,)`` [m]; ``None`` for measured ones."""
 
     def count(self, closer_than: float = np.inf) -> NDArray[np.int64]:
         """How many bodies each vehicle senses nearer than a distance [m] (strictly); ``(flocks, vehicles)``."""

@@ -16,6 +16,7 @@ from sb3_flock.settings import NotNegative, Settings
 from sb3_flock.sim.dynamics import DynamicsSettings
 from sb3_flock.sim.randomization import FlockValues, own_rngs, rng_states, rngs_of
 from sb3_flock.sim.sensing import Contacts, Sensing
+from sb3_flock.sim.tracker import Tracker, TrackerSettings
 from sb3_flock.sim.visibility import in_view, known_obstacles, occluded, select
 
 if TYPE_CHECKING:
@@ -64,6 +65,9 @@ class SensorSettings(DynamicsSettings):
         "0: no motion channels (paper: 0)",
     )
     sensors: SensorErrors = Field(default_factory=SensorErrors, description="errors of what vehicles measure (paper: none)")
+    tracker: TrackerSettings = Field(
+        default_factory=TrackerSettings, description="estimation on board from what vehicles measure (paper: none)"
+    )
 
     @model_validator(mode="after")
     def _lag_is_whole_steps(self) -> SensorSettings:
@@ -111,6 +115,7 @@ class Sensors:
         self.is_exact = self.settings.sensors == SensorErrors() and not errors.are_drawn
         self._delays = np.rint(errors.delay[:, 0] / self.settings.time_step).astype(np.int64)
         self._measured: deque[Sensing] = deque(maxlen=1 + int(self._delays.max()))
+        self._tracker = Tracker(self.settings, self.ranges, errors) if self.settings.tracker.enabled else None
 
     def reset(self, rngs: Sequence[Generator]) -> None:
         """Start an episode; exact sensors draw nothing from the flocks' generators."""
@@ -123,6 +128,8 @@ class Sensors:
         self.latest = None
         self._history.clear()
         self._measured.clear()
+        if self._tracker is not None:
+            self._tracker.reset()
 
     def measure(self, truth: Sensing) -> Sensing:
         """What the vehicles act on; call this once a step. Until the delay is over, that is the first measurement."""
@@ -131,9 +138,13 @@ class Sensors:
 
     def _measure(self, truth: Sensing) -> Sensing:
         has_memory = self._history.maxlen != 1
-        if self.is_exact and not has_memory:
+        if self.is_exact and not has_memory and self._tracker is None:
             return truth
         measured = truth if self.is_exact else self._with_errors(truth)
+        if self._tracker is not None:
+            self._measured.append(measured)
+            estimate = self._tracker.update(self._delayed(), measured.ego_motion)
+            return self._with_previous(estimate) if has_memory else estimate
         if has_memory:
             measured = self._with_previous(measured)
         self._measured.append(measured)
@@ -149,10 +160,12 @@ class Sensors:
 
     def state_dict(self) -> dict[str, Any]:
         """The random streams, the memory and the delayed measurements: plain values and arrays."""
+        tracker = {} if self._tracker is None else {"tracker": self._tracker.state_dict()}
         return {
             "rngs": rng_states(self._rngs),
             "history": [asdict(sensing) for sensing in self._history],
             "measured": [asdict(sensing) for sensing in self._measured],
+            **tracker,
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -162,6 +175,10 @@ class Sensors:
             kept.clear()
             kept.extend(_sensing(sensing) for sensing in saved)
         self.latest = self._delayed() if self._measured else None
+        if self._tracker is not None:
+            self._tracker.load_state_dict(state.get("tracker", {}))
+            if self.latest is not None:
+                self.latest = replace(self._tracker.estimate(), previous=self._history[0] if self._history else None)
 
     def _with_previous(self, measured: Sensing) -> Sensing:
         """Adds what was measured ``motion_lag`` ago, or at the start, in the vehicles' present frames."""
