@@ -115,6 +115,10 @@ def filter_actions(
 ) -> NDArray[np.float64]:
     """The actions with their speeds bounded; each vehicle uses what it senses, and with ``announce`` what neighbors announce.
 
+    Of a body whose position is estimated it keeps ``tracker.margin_stds`` standard deviations more. A neighbor that it knows by
+    messages alone came into range in the last step: it is at least ``link_range`` less a step's approach away, straight ahead at
+    the worst.
+
     Vehicles that cannot stop at once keep the way free that they need in order to stop, straight on. That lowers the number of
     violations; the guarantee is for vehicles that stop at once.
 
@@ -140,6 +144,12 @@ def filter_actions(
         strides = np.concatenate((strides, _cosines(obstacles) * dt))
         gaps_of_obstacles = obstacles.distances - kept - _uncertain(obstacles, settings)
         budgets = np.concatenate((budgets, np.maximum(gaps_of_obstacles, 0.0)))
+    if sensing.unplaced is not None and settings.safety_filter != "off":
+        rows, step = np.flatnonzero(sensing.unplaced), 2 * settings.max_speed * dt
+        gap = max(settings.link_range - step - settings.neighbor_separation - margin, 0.0)
+        observers = np.concatenate((observers, rows))
+        strides = np.concatenate((strides, np.full(len(rows), dt)))
+        budgets = np.concatenate((budgets, np.full(len(rows), gap / 2)))
     rounding = ROUNDING * (margin + max(settings.neighbor_separation, settings.obstacle_separation))
     asked = actions[..., 0].ravel()
 

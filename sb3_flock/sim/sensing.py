@@ -129,6 +129,9 @@ class Sensing:
     Where vehicles also move to the side, ``(flocks, vehicles, 3)``: the third is to the left [m], before the turn."""
     previous: Sensing | None = None
     """What was sensed ``motion_lag`` ago, in the vehicles' present frames; ``None`` without motion channels."""
+    unplaced: NDArray[np.bool_] | None = None
+    """Whether a vehicle receives messages of a neighbor whose place it does not know yet, ``(vehicles of all flocks,)``; ``None``
+    without a tracker and ``shared_motion``."""
 
     def compensate_ego_motion(self, ego_motion: NDArray[np.float64]) -> Sensing:
         """The same bodies, where they were, in the vehicles' frames after a further :attr:`ego_motion`."""

@@ -16,7 +16,7 @@ from sb3_flock.settings import NotNegative, Settings
 from sb3_flock.sim.dynamics import DynamicsSettings
 from sb3_flock.sim.randomization import FlockValues, own_rngs, rng_states, rngs_of
 from sb3_flock.sim.sensing import Contacts, Sensing
-from sb3_flock.sim.tracker import Tracker, TrackerSettings
+from sb3_flock.sim.tracker import Messages, Tracker, TrackerSettings
 from sb3_flock.sim.visibility import in_view, known_obstacles, occluded, select
 
 if TYPE_CHECKING:
@@ -116,6 +116,7 @@ class Sensors:
         self._delays = np.rint(errors.delay[:, 0] / self.settings.time_step).astype(np.int64)
         self._measured: deque[Sensing] = deque(maxlen=1 + int(self._delays.max()))
         self._tracker = Tracker(self.settings, self.ranges, errors) if self.settings.tracker.enabled else None
+        self._estimate: Sensing | None = None
 
     def reset(self, rngs: Sequence[Generator]) -> None:
         """Start an episode; exact sensors draw nothing from the flocks' generators."""
@@ -128,6 +129,7 @@ class Sensors:
         self.latest = None
         self._history.clear()
         self._measured.clear()
+        self._estimate = None
         if self._tracker is not None:
             self._tracker.reset()
 
@@ -143,12 +145,20 @@ class Sensors:
         measured = truth if self.is_exact else self._with_errors(truth)
         if self._tracker is not None:
             self._measured.append(measured)
-            estimate = self._tracker.update(self._delayed(), measured.ego_motion)
-            return self._with_previous(estimate) if has_memory else estimate
+            self._estimate = self._tracker.update(self._delayed(), measured.ego_motion, self._messages(truth, measured))
+            return self._with_previous(self._estimate) if has_memory else self._estimate
         if has_memory:
             measured = self._with_previous(measured)
         self._measured.append(measured)
         return self._delayed()
+
+    def _messages(self, truth: Sensing, measured: Sensing) -> Messages | None:
+        """What neighbors share for the tracker: vehicles in link range communicate, whether they see each other or not."""
+        if not self.settings.tracker.shared_motion:
+            return None
+        if self._bodies is None:
+            raise ValueError("bodies = None: shared_motion needs to know the headings of all vehicles")
+        return Messages(self._bodies().frames, measured.ego_motion, truth.neighbors.observers, truth.neighbors.bodies)
 
     def _delayed(self) -> Sensing:
         """What is used now: what was measured before the delay, or first."""
@@ -160,7 +170,9 @@ class Sensors:
 
     def state_dict(self) -> dict[str, Any]:
         """The random streams, the memory and the delayed measurements: plain values and arrays."""
-        tracker = {} if self._tracker is None else {"tracker": self._tracker.state_dict()}
+        tracker = {}
+        if self._tracker is not None and self._estimate is not None:
+            tracker = {"tracker": self._tracker.state_dict(), "estimate": asdict(self._estimate)}
         return {
             "rngs": rng_states(self._rngs),
             "history": [asdict(sensing) for sensing in self._history],
@@ -175,10 +187,11 @@ class Sensors:
             kept.clear()
             kept.extend(_sensing(sensing) for sensing in saved)
         self.latest = self._delayed() if self._measured else None
-        if self._tracker is not None:
-            self._tracker.load_state_dict(state.get("tracker", {}))
-            if self.latest is not None:
-                self.latest = replace(self._tracker.estimate(), previous=self._history[0] if self._history else None)
+        self._estimate = None
+        if self._tracker is not None and "tracker" in state:
+            self._tracker.load_state_dict(state["tracker"])
+            self._estimate = _sensing(state["estimate"])
+            self.latest = replace(self._estimate, previous=self._history[0] if self._history else None)
 
     def _with_previous(self, measured: Sensing) -> Sensing:
         """Adds what was measured ``motion_lag`` ago, or at the start, in the vehicles' present frames."""

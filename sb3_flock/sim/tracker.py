@@ -8,6 +8,7 @@ associate them with tracks (Bar-Shalom, Li and Kirubarajan: Estimation with Appl
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
@@ -27,7 +28,13 @@ if TYPE_CHECKING:
     from sb3_flock.sim.sensors import SensorSettings
 
 _WAYPOINT_TIME = 1.0
-"""Time in which the waypoint changes its velocity by about its speed [s]."""
+"""Time in which the waypoint changes its velocity by about the vehicles' top speed [s]."""
+
+_ROUNDING = 1e-6
+"""Least standard deviation of a predicted position [sensing ranges]: a gate is never narrower than rounding errors."""
+
+_TINY = 1e-300
+"""Smallest variance that is divided by [m^2]."""
 
 
 class TrackerSettings(Settings):
@@ -58,11 +65,32 @@ class TrackerSettings(Settings):
         le=1e3,
         description="time between a detection and its use, rounded to whole steps [s]; null: sensors.delay (paper: none)",
     )
+    shared_motion: bool = Field(
+        False,
+        description="neighbors share by communication their headings and how they moved in the last step by their odometry; "
+        "tracks of neighbors then follow that motion instead of a constant velocity (paper: false)",
+    )
+    shared_motion_noise: NotNegative = Field(
+        0.05, description="standard deviation of the relative error of a motion that a neighbor shares (paper: none)"
+    )
     margin_stds: NotNegative = Field(
         2.0,
         description="what the safety filter keeps beyond safety_margin, for the uncertainty of an estimated position [standard "
         "deviations] (paper: none)",
     )
+
+
+class Messages(NamedTuple):
+    """What the vehicles of every flock share by communication, without delay."""
+
+    frames: NDArray[np.float64]
+    """Cosine and sine of their headings, ``(flocks, vehicles, 2)``."""
+    ego_motion: NDArray[np.float64]
+    """Their own motion since the last step by their odometry, :attr:`~sb3_flock.sim.Sensing.ego_motion`."""
+    receivers: NDArray[np.int64]
+    """``(messages,)``: the vehicles that receive one, numbered as in :class:`~sb3_flock.sim.Contacts`."""
+    senders: NDArray[np.int64]
+    """``(messages,)``: from whom, the vehicle's number within the flock."""
 
 
 @dataclass(frozen=True)
@@ -104,6 +132,12 @@ class Tracks:
         positions = self.positions + times[:, None] * self.velocities
         return replace(self, positions=positions, covariances=np.stack(covariances, axis=-1))
 
+    def widen(self, variances: NDArray[np.float64]) -> Tracks:
+        """The tracks with the variance of each coordinate raised, by ``(tracks,)`` [m^2]."""
+        covariances = self.covariances.copy()
+        covariances[:, 0] += variances
+        return replace(self, covariances=covariances)
+
     def update(self, positions: NDArray[np.float64], variances: NDArray[np.float64], bodies: NDArray[np.int64]) -> Tracks:
         """The tracks after a detection of each.
 
@@ -123,9 +157,6 @@ class Tracks:
             np.stack((own * kept, mixed * kept, rate - mixed * mixed / total), axis=-1),
         )
 
-
-_TINY = 1e-30
-"""Smallest variance that is divided by [m^2]."""
 
 _NONE = Tracks(*(np.empty(0, np.int64) for _ in range(3)), *(np.empty((0, size)) for size in (2, 2, 3)))
 
@@ -172,115 +203,163 @@ def associate(
 class Tracker:
     """The tracks of every vehicle of every flock, and what they give: the bodies where they are now.
 
-    Detections and waypoint are those of the sensors' delay ago; odometry has no delay. A detection that no track takes starts a
-    track. A track that takes none survives ``max_missed`` steps. Where sensors miss nothing in their field of view, it ends there
-    at once. The waypoint has one track, which takes every measurement.
+    Detections and waypoint are those of the sensors' delay ago; odometry and messages have no delay. A detection that no track
+    takes starts a track. A track that takes none survives ``max_missed`` steps, or none where the sensors miss nothing that is in
+    their field of view. The waypoint has one track, which takes every measurement.
 
     :param settings: the tracker's settings, the bounds of the bodies' motion, and the time step
     :param ranges: how far vehicles sense
     :param errors: what is known of the sensors' errors, of each flock where they are randomized
+
+    :ivar tracks: by kind of body: ``neighbors``, ``obstacles``, ``waypoint``
     """
 
     def __init__(self, settings: SensorSettings, ranges: SensingSettings, errors: FlockValues) -> None:
         own, speed, obstacle_speed = settings.tracker, settings.max_speed, settings.obstacle_max_speed
         self.settings, self.time_step, self._errors = own, settings.time_step, errors
-        neighbor = speed * settings.max_turn_rate if own.neighbor_acceleration is None else own.neighbor_acceleration
-        obstacle = own.obstacle_acceleration
+        neighbor, obstacle = own.neighbor_acceleration, own.obstacle_acceleration
+        neighbor = speed * settings.max_turn_rate if neighbor is None else neighbor
         obstacle = obstacle_speed * settings.obstacle_turn_std if obstacle is None else obstacle
         self._kinds = {
-            "neighbors": _Kind(ranges.link_range, speed, neighbor, own.gate),
+            "neighbors": _Kind(ranges.link_range, speed, neighbor, own.gate, own.shared_motion),
             "obstacles": _Kind(ranges.known_obstacle_range, obstacle_speed, obstacle, own.gate),
-            "waypoint": _Kind(np.inf, speed, speed / _WAYPOINT_TIME, np.inf),
+            "waypoint": _Kind(math.inf, speed, speed / _WAYPOINT_TIME, math.inf),
         }
         delay = errors.delay if own.assumed_delay is None else np.full((1, 1), own.assumed_delay)
         self._delays = np.rint(delay[:, 0] / self.time_step).astype(np.int64)
         self._noise = errors.position_noise if own.assumed_noise is None else np.full((1, 1), own.assumed_noise)
-        self._poses: deque[NDArray[np.float64]] = deque(maxlen=1 + int(self._delays.max()))
-        self._ego_motion = np.zeros((0, 0, 2))
+        longest = int(self._delays.max())
+        self._poses: deque[NDArray[np.float64]] = deque(maxlen=1 + longest)
+        self._ways: deque[NDArray[np.float64]] = deque(maxlen=2 + longest)
         self.reset()
 
     def reset(self) -> None:
         """Drop all tracks."""
         self._steps = 0
         self._poses.clear()
+        self._ways.clear()
         self.tracks = dict.fromkeys(self._kinds, _NONE)
 
-    def update(self, measured: Sensing, ego_motion: NDArray[np.float64]) -> Sensing:
+    def update(self, measured: Sensing, ego_motion: NDArray[np.float64], messages: Messages | None = None) -> Sensing:
         """Take a measurement, once a step, and estimate where the bodies are now.
 
         :param measured: in the vehicles' frames of the sensors' delay ago; until the delay is over, the first measurement
         :param ego_motion: since the last step, measured without delay, :attr:`~sb3_flock.sim.Sensing.ego_motion`
+        :param messages: needed for ``shared_motion`` alone
+        :return: in the vehicles' present frames, the bodies that are in sensing range now
         """
         shape = measured.waypoint_distances.shape
         self._poses.append(_moved(self._poses[-1], ego_motion) if self._steps else np.zeros((*shape, 3)))
-        self._ego_motion = ego_motion
+        turns = None
+        if self.settings.shared_motion:
+            if messages is None:
+                raise ValueError("messages = None: shared_motion needs what the neighbors share")
+            turns = self._take(messages)
         numbers = np.arange(shape[0] * shape[1])
         positions, distances = measured.waypoint_positions.reshape(-1, 2), measured.waypoint_distances.ravel()
         waypoints = Contacts(shape, numbers, np.zeros_like(numbers), positions, distances)
         detected = {"neighbors": measured.neighbors, "obstacles": measured.obstacles, "waypoint": waypoints}
         for name, contacts in detected.items():
-            self.tracks[name] = self._after(contacts, self._kinds[name], self.tracks[name])
+            self.tracks[name] = self._after(contacts, self._kinds[name], self.tracks[name], ego_motion, turns)
         self._steps += 1
-        return self.estimate()
-
-    def estimate(self) -> Sensing:
-        """Where the tracked bodies are now, in the vehicles' present frames, as far as they are in sensing range."""
-        neighbors, obstacles, waypoints = (self._now(kind, self.tracks[name]) for name, kind in self._kinds.items())
-        shape = neighbors.shape
-        positions, distances = waypoints.positions.reshape(*shape, 2), waypoints.distances.reshape(shape)
-        return Sensing(neighbors, obstacles, positions, distances, self._ego_motion)
+        neighbors, obstacles, waypoint = (self._now(kind, self.tracks[name], turns) for name, kind in self._kinds.items())
+        return Sensing(
+            neighbors,
+            obstacles,
+            waypoint.positions.reshape(*shape, 2),
+            waypoint.distances.reshape(shape),
+            ego_motion,
+            unplaced=None if messages is None or turns is None else _unplaced(neighbors, messages),
+        )
 
     def state_dict(self) -> dict[str, Any]:
-        """The tracks and the odometry: plain values and arrays; empty before the first measurement."""
+        """The tracks and the odometry: plain values and arrays."""
         tracks = {name: dict(vars(tracks)) for name, tracks in self.tracks.items()}
-        state = {"steps": self._steps, "poses": list(self._poses), "ego_motion": self._ego_motion, "tracks": tracks}
-        return state if self._steps else {}
+        return {"steps": self._steps, "poses": list(self._poses), "ways": list(self._ways), "tracks": tracks}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore :meth:`state_dict`."""
         self.reset()
-        if state:
-            self._steps, self._ego_motion = int(state["steps"]), np.array(state["ego_motion"])
-            self._poses.extend(np.array(pose) for pose in state["poses"])
-            self.tracks = {name: Tracks(**state["tracks"][name]) for name in self._kinds}
+        self._steps = int(state["steps"])
+        self._poses.extend(np.array(pose) for pose in state["poses"])
+        self._ways.extend(np.array(way) for way in state["ways"])
+        self.tracks = {name: Tracks(**state["tracks"][name]) for name in self._kinds}
 
-    def _after(self, contacts: Contacts, kind: _Kind, tracks: Tracks) -> Tracks:
-        """The tracks of one kind after the detections; where the delay is not over yet, there are no new ones."""
+    def _take(self, messages: Messages) -> NDArray[np.float64]:
+        """Add up how the vehicles moved; the turns from the frame of their headings into their odometry frames, ``(vehicles,)``."""
+        headings = np.arctan2(messages.frames[..., 1], messages.frames[..., 0])
+        before = np.zeros((*headings.shape, 3))
+        before[..., 2] = headings - messages.ego_motion[..., 1]
+        way = _moved(before, messages.ego_motion)[..., :2]
+        self._ways.append(self._ways[-1] + way if self._ways else np.zeros_like(way))
+        return (self._poses[-1][..., 2] - headings).ravel()
+
+    def _after(
+        self,
+        contacts: Contacts,
+        kind: _Kind,
+        tracks: Tracks,
+        ego_motion: NDArray[np.float64],
+        turns: NDArray[np.float64] | None,
+    ) -> Tracks:
+        """The tracks of one kind after the detections; until the delay is over, there are no new ones after the first."""
         n_flocks, vehicles = contacts.shape
         is_new = np.broadcast_to((self._steps == 0) | (self._steps > self._delays), (n_flocks,))
-        waits, is_fresh = (~is_new[tracks.observers // vehicles], is_new[contacts.observers // vehicles])
+        waits, is_fresh = ~is_new[tracks.observers // vehicles], is_new[contacts.observers // vehicles]
         waiting, tracks = tracks.select(waits), tracks.select(~waits)
         observers, bodies = contacts.observers[is_fresh], contacts.bodies[is_fresh]
         poses = self._poses_of_detections(n_flocks)
         positions = _to_odometry(contacts.positions[is_fresh], poses[observers])
         variances = np.square(np.broadcast_to(self._noise[:, 0], (n_flocks,))[observers // vehicles])
 
-        tracks = tracks.predict(np.full(len(tracks.observers), self.time_step), kind.intensity(self.time_step))
-        if self._errors.is_on("odometry_noise"):
-            tracks = self._drifted(tracks, poses)
+        ages = self._ages(n_flocks)
+        tracks = self._predicted(tracks, kind, ages + 1, ages, turns)
+        tracks = tracks.widen(self._drift(tracks, poses, ego_motion) + kind.least_variance)
         track, detection = associate(tracks, observers, positions, variances, kind.gate)
         updated = tracks.select(track).update(positions[detection], variances[detection], bodies[detection])
         missed = tracks.select(np.delete(np.arange(len(tracks.observers)), track))
         missed = replace(missed, missed=missed.missed + 1)
         missed = missed.select((missed.missed <= self.settings.max_missed) & self._may_be_missed(missed, poses, n_flocks))
         first = np.delete(np.arange(len(observers)), detection)
-        unknown = np.full(len(first), (kind.max_speed / 2) ** 2)
-        covariances = np.stack((variances[first], np.zeros(len(first)), unknown), axis=-1)
         zeros = np.zeros(len(first), np.int64)
+        covariances = np.stack((variances[first], zeros, np.full(len(first), kind.unknown_velocity)), axis=-1)
         born = Tracks(observers[first], bodies[first], zeros, positions[first], np.zeros((len(first), 2)), covariances)
         return _joined(waiting, updated, missed, born)
 
-    def _now(self, kind: _Kind, tracks: Tracks) -> Contacts:
+    def _now(self, kind: _Kind, tracks: Tracks, turns: NDArray[np.float64] | None) -> Contacts:
         """Where the tracked bodies of one kind are now."""
         pose = self._poses[-1]
-        ages = self._ages(len(pose))[tracks.observers // pose.shape[1]]
-        tracks = tracks.predict(ages * self.time_step, kind.intensity(self.time_step))
+        ages = self._ages(len(pose))
+        tracks = self._predicted(tracks, kind, ages, np.zeros_like(ages), turns)
         positions = _to_body(tracks.positions, pose.reshape(-1, 3)[tracks.observers])
-        distances = np.hypot(positions[:, 0], positions[:, 1])
+        distances = np.sqrt(np.square(positions).sum(-1))
         near = distances < kind.sensing_range
         stds = np.sqrt(tracks.covariances[near, 0])
         rows = tracks.observers[near], tracks.bodies[near], positions[near], distances[near], stds
         return Contacts((pose.shape[0], pose.shape[1]), *rows)
+
+    def _predicted(
+        self,
+        tracks: Tracks,
+        kind: _Kind,
+        since: NDArray[np.int64],
+        until: NDArray[np.int64],
+        turns: NDArray[np.float64] | None,
+    ) -> Tracks:
+        """The tracks of some steps ago, ``since``, as they were or are fewer steps ago, ``until``; both ``(flocks,)``."""
+        vehicles = self._poses[-1].shape[1]
+        flocks = tracks.observers // vehicles
+        if turns is None or not kind.shares_motion:
+            return tracks.predict((since - until)[flocks] * self.time_step, kind.acceleration**2 * self.time_step)
+        last, first = len(self._ways) - 1, np.minimum(since, len(self._ways) - 1)
+        steps = enumerate(zip(first.tolist(), until.tolist(), strict=True))
+        ways = np.concatenate([self._ways[last - end][f] - self._ways[last - start][f] for f, (start, end) in steps])
+        own = ways[flocks * vehicles + tracks.bodies]
+        angles = turns[tracks.observers]
+        shared = to_body(own, np.stack((np.cos(angles), -np.sin(angles)), axis=-1))
+        relative = self.settings.shared_motion_noise**2 + np.square(self._errors.of_flocks("odometry_noise", len(since)))
+        moved = replace(tracks, positions=tracks.positions + shared)
+        return moved.widen(relative[flocks] * np.square(own).sum(-1))
 
     def _ages(self, n_flocks: int) -> NDArray[np.int64]:
         """How many steps ago the last detections were made, ``(flocks,)``."""
@@ -291,24 +370,25 @@ class Tracker:
         last = len(self._poses) - 1
         return np.concatenate([self._poses[last - age][flock] for flock, age in enumerate(self._ages(n_flocks).tolist())])
 
-    def _drifted(self, tracks: Tracks, poses: NDArray[np.float64]) -> Tracks:
-        """The tracks with the uncertainty of what the vehicles measured of their own motion in a step."""
-        errors = np.square(self._errors.odometry_noise[..., None] * self._ego_motion)
-        forward, turn = (part.reshape(-1)[tracks.observers] for part in (errors[..., ::2].sum(-1), errors[..., 1]))
-        offsets = tracks.positions - poses[tracks.observers, :2]
-        covariances = tracks.covariances.copy()
-        covariances[:, 0] += forward + turn * np.square(offsets).sum(-1)
-        return replace(tracks, covariances=covariances)
+    def _drift(
+        self, tracks: Tracks, poses: NDArray[np.float64], ego_motion: NDArray[np.float64]
+    ) -> NDArray[np.float64] | float:
+        """Variance that errors of a vehicle's own odometry in a step give to its tracks, ``(tracks,)`` [m^2]."""
+        if not self._errors.is_on("odometry_noise"):
+            return 0.0
+        errors = np.square(self._errors.odometry_noise[..., None] * ego_motion)
+        forward, turn = (part.ravel()[tracks.observers] for part in (errors[..., ::2].sum(-1), errors[..., 1]))
+        return forward + turn * np.square(tracks.positions - poses[tracks.observers, :2]).sum(-1)
 
     def _may_be_missed(self, tracks: Tracks, poses: NDArray[np.float64], n_flocks: int) -> NDArray[np.bool_]:
-        """Whether a body of a track that took no detection may be in range all the same, ``(tracks,)``."""
+        """Whether a body whose track took no detection may be in range all the same, ``(tracks,)``."""
         dropout, occlusion, view = (
             self._errors.of_flocks(name, n_flocks) for name in ("dropout", "occlusion", "field_of_view")
         )
         flocks = tracks.observers // (len(poses) // n_flocks)
         positions = _to_body(tracks.positions, poses[tracks.observers])
-        is_behind = np.abs(np.arctan2(positions[:, 1], positions[:, 0])) > view[flocks] / 2
-        return is_behind | ((dropout > 0) | (occlusion > 0))[flocks]
+        is_out_of_view = np.abs(np.arctan2(positions[:, 1], positions[:, 0])) > view[flocks] / 2
+        return is_out_of_view | ((dropout > 0) | (occlusion > 0))[flocks]
 
 
 class _Kind(NamedTuple):
@@ -318,10 +398,25 @@ class _Kind(NamedTuple):
     max_speed: float
     acceleration: float
     gate: float
+    shares_motion: bool = False
 
-    def intensity(self, time_step: float) -> float:
-        """Intensity of the white noise of the acceleration [m^2/s^3]."""
-        return self.acceleration**2 * time_step
+    @property
+    def least_variance(self) -> float:
+        """Of a predicted coordinate [m^2]."""
+        return 0.0 if math.isinf(self.sensing_range) else (_ROUNDING * self.sensing_range) ** 2
+
+    @property
+    def unknown_velocity(self) -> float:
+        """Variance of each coordinate of a velocity of which nothing is measured yet [m^2/s^2]."""
+        return 0.0 if self.shares_motion else (self.max_speed / 2) ** 2
+
+
+def _unplaced(neighbors: Contacts, messages: Messages) -> NDArray[np.bool_]:
+    """Which vehicles receive a message of a neighbor that none of their tracks is of, ``(vehicles of all flocks,)``."""
+    flocks, vehicles = neighbors.shape
+    tracked = neighbors.observers * vehicles + neighbors.bodies
+    is_unknown = ~np.isin(messages.receivers * vehicles + messages.senders, tracked)
+    return np.bincount(messages.receivers[is_unknown], minlength=flocks * vehicles) > 0
 
 
 def _joined(*parts: Tracks) -> Tracks:
