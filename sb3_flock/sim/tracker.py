@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -95,48 +95,37 @@ class Messages(NamedTuple):
 
 @dataclass(frozen=True)
 class Tracks:
-    """Tracked bodies of one kind: one row a track, in the order of the vehicles that track.
+    """Tracked bodies: one row a track, in the order of their series.
 
-    The covariance of a track is the same along both axes, without correlation between them.
+    A series is one kind of bodies that one vehicle tracks. Series number k n + i is that of kind k and vehicle i, of n vehicles of
+    all flocks. The covariance of a track is the same along both axes, without correlation between them.
     """
 
-    observers: NDArray[np.int64]
-    """``(tracks,)``: the vehicle that tracks, numbered as in :class:`~sb3_flock.sim.Contacts`."""
-    bodies: NDArray[np.int64]
-    """``(tracks,)``: the number of the body whose detection the track took last. No estimate depends on it."""
-    missed: NDArray[np.int64]
-    """``(tracks,)``: detections in succession that the track has missed."""
-    positions: NDArray[np.float64]
-    """``(tracks, 2)`` [m], in the observer's odometry frame."""
-    velocities: NDArray[np.float64]
-    """``(tracks, 2)`` [m/s], over ground, in the same frame."""
+    labels: NDArray[np.int64]
+    """``(tracks, 3)``: the series, the number of the body whose detection the track took last, on which no estimate depends, and
+    the detections in succession that the track has missed."""
+    means: NDArray[np.float64]
+    """``(tracks, 4)``: position [m] and velocity over ground [m/s], in the vehicle's odometry frame."""
     covariances: NDArray[np.float64]
     """``(tracks, 3)``: of a coordinate [m^2], of a coordinate and its velocity [m^2/s], of the velocity [m^2/s^2]."""
 
     def select(self, rows: NDArray[Any]) -> Tracks:
         """Some of the tracks."""
-        return Tracks(*(getattr(self, field.name)[rows] for field in fields(self)))
+        return Tracks(self.labels[rows], self.means[rows], self.covariances[rows])
 
-    def predict(self, times: NDArray[np.float64], intensity: float) -> Tracks:
+    def predict(self, times: NDArray[np.float64] | float, intensities: NDArray[np.float64]) -> Tracks:
         """The tracks some time later: constant velocity, disturbed by white noise of the acceleration.
 
-        :param times: ``(tracks,)`` [s]
-        :param intensity: of the noise [m^2/s^3]
+        :param times: ``(tracks,)`` [s], or one for all
+        :param intensities: of the noise, ``(tracks,)`` [m^2/s^3]
         """
         own, mixed, rate = self.covariances.T
-        covariances = (
-            own + times * (2 * mixed + times * (rate + intensity * times / 3)),
-            mixed + times * (rate + intensity * times / 2),
-            rate + intensity * times,
-        )
-        positions = self.positions + times[:, None] * self.velocities
-        return replace(self, positions=positions, covariances=np.stack(covariances, axis=-1))
-
-    def widen(self, variances: NDArray[np.float64]) -> Tracks:
-        """The tracks with the variance of each coordinate raised, by ``(tracks,)`` [m^2]."""
-        covariances = self.covariances.copy()
-        covariances[:, 0] += variances
-        return replace(self, covariances=covariances)
+        means, covariances = self.means.copy(), np.empty_like(self.covariances)
+        means[:, :2] += np.reshape(times, (-1, 1)) * means[:, 2:]
+        covariances[:, 0] = own + times * (2 * mixed + times * (rate + intensities * times / 3))
+        covariances[:, 1] = mixed + times * (rate + intensities * times / 2)
+        covariances[:, 2] = rate + intensities * times
+        return Tracks(self.labels, means, covariances)
 
     def update(self, positions: NDArray[np.float64], variances: NDArray[np.float64], bodies: NDArray[np.int64]) -> Tracks:
         """The tracks after a detection of each.
@@ -147,57 +136,59 @@ class Tracks:
         """
         own, mixed, rate = self.covariances.T
         total = np.maximum(own + variances, _TINY)
-        kept, innovations = variances / total, positions - self.positions
-        return Tracks(
-            self.observers,
-            bodies,
-            np.zeros_like(self.missed),
-            positions - kept[:, None] * innovations,
-            self.velocities + (mixed / total)[:, None] * innovations,
-            np.stack((own * kept, mixed * kept, rate - mixed * mixed / total), axis=-1),
-        )
+        kept, gain = variances / total, mixed / total
+        labels, means, covariances = self.labels.copy(), self.means.copy(), np.empty_like(self.covariances)
+        innovations = positions - means[:, :2]
+        labels[:, 1], labels[:, 2] = bodies, 0
+        means[:, :2] = positions - kept[:, None] * innovations  # exactly the position where there is no noise
+        means[:, 2:] += gain[:, None] * innovations
+        covariances[:, 0], covariances[:, 1], covariances[:, 2] = own * kept, mixed * kept, rate - mixed * gain
+        return Tracks(labels, means, covariances)
 
 
-_NONE = Tracks(*(np.empty(0, np.int64) for _ in range(3)), *(np.empty((0, size)) for size in (2, 2, 3)))
+_NONE = Tracks(np.empty((0, 3), np.int64), np.empty((0, 4)), np.empty((0, 3)))
 
 
 def associate(
-    tracks: Tracks, observers: NDArray[np.int64], positions: NDArray[np.float64], variances: NDArray[np.float64], gate: float
+    tracks: Tracks,
+    series: NDArray[np.int64],
+    positions: NDArray[np.float64],
+    variances: NDArray[np.float64],
+    gates: NDArray[np.float64],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Which detection belongs to which track, without identities: one to one, the nearest pair of all first.
+    """Which detection belongs to which track of its series, without identities: one to one, the nearest pair of all first.
 
     The distance of a pair is in standard deviations of what is expected, that of the track and of the detection together.
 
-    :param observers: the vehicle that detects, ascending, ``(detections,)``
-    :param positions: detected, in the observers' odometry frames, ``(detections, 2)`` [m]
+    :param series: of each detection, ascending, ``(detections,)``
+    :param positions: detected, in the vehicles' odometry frames, ``(detections, 2)`` [m]
     :param variances: of each detected coordinate, ``(detections,)`` [m^2]
-    :param gate: largest distance of a pair [standard deviations]
+    :param gates: largest distance of each detection from its track, ``(detections,)`` [standard deviations]
     :return: the associated rows of ``tracks`` and of the detections
     """
-    first, last = (np.searchsorted(observers, tracks.observers, side=side) for side in ("left", "right"))
-    counts = last - first
+    first = np.searchsorted(series, tracks.labels[:, 0])
+    counts = np.searchsorted(series, tracks.labels[:, 0], side="right") - first
     track = np.repeat(np.arange(len(counts)), counts)
     detection = np.repeat(first - (np.cumsum(counts) - counts), counts) + np.arange(len(track))
-    squares = np.square(positions[detection] - tracks.positions[track])
+    squares = np.square(positions[detection] - tracks.means[track, :2])
     expected = np.maximum(tracks.covariances[track, 0] + variances[detection], _TINY)
     distances = (squares[:, 0] + squares[:, 1]) / expected
-    near = np.flatnonzero(distances <= gate * gate)
+    near = np.flatnonzero(distances <= np.square(gates)[detection])
     near = near[np.argsort(distances[near], kind="stable")]
     track, detection = track[near], detection[near]
-    chosen: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []
+    of_track, of_detection = np.full(len(counts), -1), np.empty(len(series), np.int64)
     while len(track):
-        rank = np.arange(len(track))
-        best_of_track, best_of_detection = np.full(len(counts), len(rank)), np.full(len(observers), len(rank))
-        best_of_track[track[::-1]] = best_of_detection[detection[::-1]] = rank[::-1]
-        is_best = (best_of_track[track] == rank) & (best_of_detection[detection] == rank)
-        chosen.append((track[is_best], detection[is_best]))
-        taken_tracks, taken_detections = np.zeros(len(counts), bool), np.zeros(len(observers), bool)
-        taken_tracks[track[is_best]] = taken_detections[detection[is_best]] = True
-        left = ~(taken_tracks[track] | taken_detections[detection])
+        rank = np.arange(len(track))[::-1]  # of several values for one place the last one stays: the nearest pair
+        best_of_track, best_of_detection = np.empty(len(counts), np.int64), np.empty(len(series), np.int64)
+        best_of_track[track[::-1]] = best_of_detection[detection[::-1]] = rank
+        is_best = best_of_track[track] == best_of_detection[detection]
+        of_track[track[is_best]] = detection[is_best]
+        of_detection[:] = -1
+        of_detection[detection[is_best]] = 0
+        left = (of_track[track] < 0) & (of_detection[detection] < 0)
         track, detection = track[left], detection[left]
-    if not chosen:
-        return np.empty(0, np.int64), np.empty(0, np.int64)
-    return tuple(np.concatenate(parts) for parts in zip(*chosen, strict=True))
+    found = np.flatnonzero(of_track >= 0)
+    return found, of_track[found]
 
 
 class Tracker:
@@ -210,8 +201,6 @@ class Tracker:
     :param settings: the tracker's settings, the bounds of the bodies' motion, and the time step
     :param ranges: how far vehicles sense
     :param errors: what is known of the sensors' errors, of each flock where they are randomized
-
-    :ivar tracks: by kind of body: ``neighbors``, ``obstacles``, ``waypoint``
     """
 
     def __init__(self, settings: SensorSettings, ranges: SensingSettings, errors: FlockValues) -> None:
@@ -220,14 +209,18 @@ class Tracker:
         neighbor, obstacle = own.neighbor_acceleration, own.obstacle_acceleration
         neighbor = speed * settings.max_turn_rate if neighbor is None else neighbor
         obstacle = obstacle_speed * settings.obstacle_turn_std if obstacle is None else obstacle
-        self._kinds = {
-            "neighbors": _Kind(ranges.link_range, speed, neighbor, own.gate, own.shared_motion),
-            "obstacles": _Kind(ranges.known_obstacle_range, obstacle_speed, obstacle, own.gate),
-            "waypoint": _Kind(math.inf, speed, speed / _WAYPOINT_TIME, math.inf),
-        }
+        speeds, accelerations = np.array([speed, obstacle_speed, speed]), np.array([neighbor, obstacle, speed / _WAYPOINT_TIME])
+        if own.shared_motion:
+            speeds[0] = accelerations[0] = 0.0  # no velocity of a neighbor is estimated
+        self._ranges = np.array([ranges.link_range, ranges.known_obstacle_range, np.inf])
+        self._gates = np.array([own.gate, own.gate, np.inf])
+        self._unknown_velocity = np.square(speeds / 2)
+        self._intensities = np.square(accelerations) * self.time_step
+        self._least_variance = np.square(_ROUNDING * ranges.link_range)
         delay = errors.delay if own.assumed_delay is None else np.full((1, 1), own.assumed_delay)
         self._delays = np.rint(delay[:, 0] / self.time_step).astype(np.int64)
-        self._noise = errors.position_noise if own.assumed_noise is None else np.full((1, 1), own.assumed_noise)
+        noise = errors.position_noise if own.assumed_noise is None else np.full((1, 1), own.assumed_noise)
+        self._variances = np.square(noise[:, 0])
         longest = int(self._delays.max())
         self._poses: deque[NDArray[np.float64]] = deque(maxlen=1 + longest)
         self._ways: deque[NDArray[np.float64]] = deque(maxlen=2 + longest)
@@ -235,10 +228,9 @@ class Tracker:
 
     def reset(self) -> None:
         """Drop all tracks."""
-        self._steps = 0
+        self._steps, self.tracks, self._shape = 0, _NONE, (0, 0)
         self._poses.clear()
         self._ways.clear()
-        self.tracks = dict.fromkeys(self._kinds, _NONE)
 
     def update(self, measured: Sensing, ego_motion: NDArray[np.float64], messages: Messages | None = None) -> Sensing:
         """Take a measurement, once a step, and estimate where the bodies are now.
@@ -247,35 +239,27 @@ class Tracker:
         :param ego_motion: since the last step, measured without delay, :attr:`~sb3_flock.sim.Sensing.ego_motion`
         :param messages: needed for ``shared_motion`` alone
         :return: in the vehicles' present frames, the bodies that are in sensing range now
+        :raises ValueError: without messages that are needed
         """
-        shape = measured.waypoint_distances.shape
-        self._poses.append(_moved(self._poses[-1], ego_motion) if self._steps else np.zeros((*shape, 3)))
-        turns = None
+        n_flocks, vehicles = self._shape = measured.waypoint_distances.shape
+        motion = ego_motion.reshape(n_flocks * vehicles, -1)
+        start = np.tile((0.0, 0.0, 1.0, 0.0), (len(motion), 1))
+        self._poses.append(_moved(self._poses[-1], motion) if self._steps else start)
+        frames = None
         if self.settings.shared_motion:
             if messages is None:
                 raise ValueError("messages = None: shared_motion needs what the neighbors share")
-            turns = self._take(messages)
-        numbers = np.arange(shape[0] * shape[1])
-        positions, distances = measured.waypoint_positions.reshape(-1, 2), measured.waypoint_distances.ravel()
-        waypoints = Contacts(shape, numbers, np.zeros_like(numbers), positions, distances)
-        detected = {"neighbors": measured.neighbors, "obstacles": measured.obstacles, "waypoint": waypoints}
-        for name, contacts in detected.items():
-            self.tracks[name] = self._after(contacts, self._kinds[name], self.tracks[name], ego_motion, turns)
+            frames = self._take(messages)
+        is_new = np.broadcast_to((self._steps == 0) | (self._steps > self._delays), (n_flocks,))
+        ages = np.broadcast_to(np.minimum(self._delays, self._steps), (n_flocks,)).repeat(vehicles)
+        if is_new.any():
+            self._correct(measured, motion, frames, ages, is_new)
         self._steps += 1
-        neighbors, obstacles, waypoint = (self._now(kind, self.tracks[name], turns) for name, kind in self._kinds.items())
-        return Sensing(
-            neighbors,
-            obstacles,
-            waypoint.positions.reshape(*shape, 2),
-            waypoint.distances.reshape(shape),
-            ego_motion,
-            unplaced=None if messages is None or turns is None else _unplaced(neighbors, messages),
-        )
+        return self._now(ego_motion, frames, ages, messages)
 
     def state_dict(self) -> dict[str, Any]:
         """The tracks and the odometry: plain values and arrays."""
-        tracks = {name: dict(vars(tracks)) for name, tracks in self.tracks.items()}
-        return {"steps": self._steps, "poses": list(self._poses), "ways": list(self._ways), "tracks": tracks}
+        return {"steps": self._steps, "poses": list(self._poses), "ways": list(self._ways), "tracks": dict(vars(self.tracks))}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore :meth:`state_dict`."""
@@ -283,132 +267,130 @@ class Tracker:
         self._steps = int(state["steps"])
         self._poses.extend(np.array(pose) for pose in state["poses"])
         self._ways.extend(np.array(way) for way in state["ways"])
-        self.tracks = {name: Tracks(**state["tracks"][name]) for name in self._kinds}
+        self.tracks = Tracks(**state["tracks"])
 
     def _take(self, messages: Messages) -> NDArray[np.float64]:
-        """Add up how the vehicles moved; the turns from the frame of their headings into their odometry frames, ``(vehicles,)``."""
-        headings = np.arctan2(messages.frames[..., 1], messages.frames[..., 0])
-        before = np.zeros((*headings.shape, 3))
-        before[..., 2] = headings - messages.ego_motion[..., 1]
-        way = _moved(before, messages.ego_motion)[..., :2]
+        """Add up how the vehicles moved.
+
+        :return: cosine and sine of the turns from the odometry frames into that of the headings, ``(vehicles, 2)``
+        """
+        headings = messages.frames.reshape(-1, 2)
+        motion = messages.ego_motion.reshape(len(headings), -1)
+        before = np.zeros((len(headings), 4))
+        before[:, 2:] = _turned(headings, -motion[:, 1])
+        way = _moved(before, motion)[:, :2]
         self._ways.append(self._ways[-1] + way if self._ways else np.zeros_like(way))
-        return (self._poses[-1][..., 2] - headings).ravel()
+        (cos, sin), (own_cos, own_sin) = headings.T, self._poses[-1][:, 2:].T
+        return np.stack((cos * own_cos + sin * own_sin, sin * own_cos - cos * own_sin), axis=-1)
 
-    def _after(
+    def _correct(
         self,
-        contacts: Contacts,
-        kind: _Kind,
-        tracks: Tracks,
-        ego_motion: NDArray[np.float64],
-        turns: NDArray[np.float64] | None,
-    ) -> Tracks:
-        """The tracks of one kind after the detections; until the delay is over, there are no new ones after the first."""
-        n_flocks, vehicles = contacts.shape
-        is_new = np.broadcast_to((self._steps == 0) | (self._steps > self._delays), (n_flocks,))
-        waits, is_fresh = ~is_new[tracks.observers // vehicles], is_new[contacts.observers // vehicles]
-        waiting, tracks = tracks.select(waits), tracks.select(~waits)
-        observers, bodies = contacts.observers[is_fresh], contacts.bodies[is_fresh]
-        poses = self._poses_of_detections(n_flocks)
-        positions = _to_odometry(contacts.positions[is_fresh], poses[observers])
-        variances = np.square(np.broadcast_to(self._noise[:, 0], (n_flocks,))[observers // vehicles])
+        measured: Sensing,
+        motion: NDArray[np.float64],
+        frames: NDArray[np.float64] | None,
+        ages: NDArray[np.int64],
+        is_new: NDArray[np.bool_],
+    ) -> None:
+        """Let the tracks take the detections; until the delay is over, there are no new ones after the first.
 
-        ages = self._ages(n_flocks)
-        tracks = self._predicted(tracks, kind, ages + 1, ages, turns)
-        tracks = tracks.widen(self._drift(tracks, poses, ego_motion) + kind.least_variance)
-        track, detection = associate(tracks, observers, positions, variances, kind.gate)
+        :param ages: how many steps ago the detections were made, ``(vehicles of all flocks,)``
+        :param is_new: which flocks have new ones, ``(flocks,)``
+        """
+        size, vehicles = len(ages), self._shape[1]
+        found = measured.neighbors, measured.obstacles
+        numbers = np.arange(size)
+        observers = np.concatenate((*(contacts.observers for contacts in found), numbers))
+        bodies = np.concatenate((*(contacts.bodies for contacts in found), np.zeros_like(numbers)))
+        positions = np.concatenate((*(contacts.positions for contacts in found), measured.waypoint_positions.reshape(-1, 2)))
+        kinds = np.repeat(np.arange(3), [*(len(contacts.observers) for contacts in found), size])
+        waiting, tracks = _NONE, self.tracks
+        if not is_new.all():
+            fresh = is_new[observers // vehicles]
+            observers, bodies, positions, kinds = observers[fresh], bodies[fresh], positions[fresh], kinds[fresh]
+            fresh = is_new[tracks.labels[:, 0] % size // vehicles]
+            waiting, tracks = tracks.select(~fresh), tracks.select(fresh)
+        poses = _at(self._poses, ages)
+        positions = _to_odometry(positions, poses[observers])
+        variances = np.broadcast_to(self._variances, is_new.shape)[observers // vehicles]
+
+        tracks = self._predicted(tracks, frames, ages + 1, ages)
+        tracks.covariances[:, 0] += self._least_variance + self._drift(tracks, poses, motion)
+        series = kinds * size + observers
+        track, detection = associate(tracks, series, positions, variances, self._gates[kinds])
         updated = tracks.select(track).update(positions[detection], variances[detection], bodies[detection])
-        missed = tracks.select(np.delete(np.arange(len(tracks.observers)), track))
-        missed = replace(missed, missed=missed.missed + 1)
-        missed = missed.select((missed.missed <= self.settings.max_missed) & self._may_be_missed(missed, poses, n_flocks))
-        first = np.delete(np.arange(len(observers)), detection)
-        zeros = np.zeros(len(first), np.int64)
-        covariances = np.stack((variances[first], zeros, np.full(len(first), kind.unknown_velocity)), axis=-1)
-        born = Tracks(observers[first], bodies[first], zeros, positions[first], np.zeros((len(first), 2)), covariances)
-        return _joined(waiting, updated, missed, born)
+        is_left, is_unknown = np.ones(len(tracks.labels), bool), np.ones(len(series), bool)
+        is_left[track] = is_unknown[detection] = False
+        missed = self._surviving(tracks.select(is_left), poses)
+        labels = np.stack((series, bodies, np.zeros_like(bodies)), axis=-1)[is_unknown]
+        means = np.concatenate((positions, np.zeros_like(positions)), axis=-1)[is_unknown]
+        covariances = np.stack((variances, np.zeros_like(variances), self._unknown_velocity[kinds]), axis=-1)[is_unknown]
+        self.tracks = _joined(waiting, updated, missed, Tracks(labels, means, covariances))
 
-    def _now(self, kind: _Kind, tracks: Tracks, turns: NDArray[np.float64] | None) -> Contacts:
-        """Where the tracked bodies of one kind are now."""
-        pose = self._poses[-1]
-        ages = self._ages(len(pose))
-        tracks = self._predicted(tracks, kind, ages, np.zeros_like(ages), turns)
-        positions = _to_body(tracks.positions, pose.reshape(-1, 3)[tracks.observers])
-        distances = np.sqrt(np.square(positions).sum(-1))
-        near = distances < kind.sensing_range
-        stds = np.sqrt(tracks.covariances[near, 0])
-        rows = tracks.observers[near], tracks.bodies[near], positions[near], distances[near], stds
-        return Contacts((pose.shape[0], pose.shape[1]), *rows)
+    def _now(
+        self,
+        ego_motion: NDArray[np.float64],
+        frames: NDArray[np.float64] | None,
+        ages: NDArray[np.int64],
+        messages: Messages | None,
+    ) -> Sensing:
+        """The tracked bodies where they are now, as far as they are in range."""
+        shape, size = self._shape, len(ages)
+        tracks = self._predicted(self.tracks, frames, ages, np.zeros_like(ages))
+        kinds, observers = np.divmod(tracks.labels[:, 0], size)
+        positions = _to_body(tracks.means[:, :2], self._poses[-1][observers])
+        distances = np.sqrt(np.square(positions[:, 0]) + np.square(positions[:, 1]))
+        near, stds = distances < self._ranges[kinds], np.sqrt(tracks.covariances[:, 0])
+        columns = observers, tracks.labels[:, 1], positions, distances, stds
+        neighbors, obstacles = (
+            Contacts(shape, *(column[near & (kinds == kind)] for column in columns)) for kind in range(2)
+        )
+        waypoint = slice(len(kinds) - size, None)
+        unplaced = None if messages is None or frames is None else _unplaced(neighbors, messages)
+        places, ways = positions[waypoint].reshape(*shape, 2), distances[waypoint].reshape(shape)
+        return Sensing(neighbors, obstacles, places, ways, ego_motion, unplaced=unplaced)
 
     def _predicted(
-        self,
-        tracks: Tracks,
-        kind: _Kind,
-        since: NDArray[np.int64],
-        until: NDArray[np.int64],
-        turns: NDArray[np.float64] | None,
+        self, tracks: Tracks, frames: NDArray[np.float64] | None, since: NDArray[np.int64], until: NDArray[np.int64]
     ) -> Tracks:
-        """The tracks of some steps ago, ``since``, as they were or are fewer steps ago, ``until``; both ``(flocks,)``."""
-        vehicles = self._poses[-1].shape[1]
-        flocks = tracks.observers // vehicles
-        if turns is None or not kind.shares_motion:
-            return tracks.predict((since - until)[flocks] * self.time_step, kind.acceleration**2 * self.time_step)
-        last, first = len(self._ways) - 1, np.minimum(since, len(self._ways) - 1)
-        steps = enumerate(zip(first.tolist(), until.tolist(), strict=True))
-        ways = np.concatenate([self._ways[last - end][f] - self._ways[last - start][f] for f, (start, end) in steps])
-        own = ways[flocks * vehicles + tracks.bodies]
-        angles = turns[tracks.observers]
-        shared = to_body(own, np.stack((np.cos(angles), -np.sin(angles)), axis=-1))
-        relative = self.settings.shared_motion_noise**2 + np.square(self._errors.of_flocks("odometry_noise", len(since)))
-        moved = replace(tracks, positions=tracks.positions + shared)
-        return moved.widen(relative[flocks] * np.square(own).sum(-1))
-
-    def _ages(self, n_flocks: int) -> NDArray[np.int64]:
-        """How many steps ago the last detections were made, ``(flocks,)``."""
-        return np.broadcast_to(np.minimum(self._delays, len(self._poses) - 1), (n_flocks,))
-
-    def _poses_of_detections(self, n_flocks: int) -> NDArray[np.float64]:
-        """The vehicles' poses when the last detections were made, ``(vehicles of all flocks, 3)``."""
-        last = len(self._poses) - 1
-        return np.concatenate([self._poses[last - age][flock] for flock, age in enumerate(self._ages(n_flocks).tolist())])
+        """The tracks of some steps ago, ``since``, as they are fewer steps ago, ``until``; both ``(vehicles of all flocks,)``."""
+        kinds, observers = np.divmod(tracks.labels[:, 0], len(since))
+        steps = (since - until)[observers]
+        tracks = tracks.predict(steps * self.time_step, self._intensities[kinds])
+        if frames is not None:
+            rows = np.searchsorted(tracks.labels[:, 0], len(since))  # the neighbors are first
+            observers, vehicles = observers[:rows], self._shape[1]
+            senders = observers // vehicles * vehicles + tracks.labels[:rows, 1]
+            ways = (_at(self._ways, until) - _at(self._ways, since))[senders]
+            odometry = self._errors.of_flocks("odometry_noise", len(since) // vehicles)[observers // vehicles]
+            tracks.means[:rows, :2] += to_body(ways, frames[observers])
+            relative = self.settings.shared_motion_noise**2 + np.square(odometry)
+            tracks.covariances[:rows, 0] += relative * (np.square(ways[:, 0]) + np.square(ways[:, 1]))
+        return tracks
 
     def _drift(
-        self, tracks: Tracks, poses: NDArray[np.float64], ego_motion: NDArray[np.float64]
+        self, tracks: Tracks, poses: NDArray[np.float64], motion: NDArray[np.float64]
     ) -> NDArray[np.float64] | float:
         """Variance that errors of a vehicle's own odometry in a step give to its tracks, ``(tracks,)`` [m^2]."""
         if not self._errors.is_on("odometry_noise"):
             return 0.0
-        errors = np.square(self._errors.odometry_noise[..., None] * ego_motion)
-        forward, turn = (part.ravel()[tracks.observers] for part in (errors[..., ::2].sum(-1), errors[..., 1]))
-        return forward + turn * np.square(tracks.positions - poses[tracks.observers, :2]).sum(-1)
+        noise = self._errors.of_flocks("odometry_noise", len(poses) // self._shape[1]).repeat(self._shape[1])
+        errors = np.square(noise[:, None] * motion)
+        observers = tracks.labels[:, 0] % len(poses)
+        offsets = np.square(tracks.means[:, :2] - poses[observers, :2]).sum(-1)
+        return errors[observers, ::2].sum(-1) + errors[observers, 1] * offsets
 
-    def _may_be_missed(self, tracks: Tracks, poses: NDArray[np.float64], n_flocks: int) -> NDArray[np.bool_]:
-        """Whether a body whose track took no detection may be in range all the same, ``(tracks,)``."""
+    def _surviving(self, tracks: Tracks, poses: NDArray[np.float64]) -> Tracks:
+        """Those of the tracks that took no detection whose bodies may be in range all the same."""
+        labels = tracks.labels + np.array([0, 0, 1])
+        observers, n_flocks = labels[:, 0] % len(poses), len(poses) // self._shape[1]
+        flocks = observers // self._shape[1]
         dropout, occlusion, view = (
-            self._errors.of_flocks(name, n_flocks) for name in ("dropout", "occlusion", "field_of_view")
+            self._errors.of_flocks(name, n_flocks)[flocks] for name in ("dropout", "occlusion", "field_of_view")
         )
-        flocks = tracks.observers // (len(poses) // n_flocks)
-        positions = _to_body(tracks.positions, poses[tracks.observers])
-        is_out_of_view = np.abs(np.arctan2(positions[:, 1], positions[:, 0])) > view[flocks] / 2
-        return is_out_of_view | ((dropout > 0) | (occlusion > 0))[flocks]
-
-
-class _Kind(NamedTuple):
-    """What is known of the motion of one kind of body."""
-
-    sensing_range: float
-    max_speed: float
-    acceleration: float
-    gate: float
-    shares_motion: bool = False
-
-    @property
-    def least_variance(self) -> float:
-        """Of a predicted coordinate [m^2]."""
-        return 0.0 if math.isinf(self.sensing_range) else (_ROUNDING * self.sensing_range) ** 2
-
-    @property
-    def unknown_velocity(self) -> float:
-        """Variance of each coordinate of a velocity of which nothing is measured yet [m^2/s^2]."""
-        return 0.0 if self.shares_motion else (self.max_speed / 2) ** 2
+        x, y = _to_body(tracks.means[:, :2], poses[observers]).T
+        may_be_missed = (dropout > 0) | (occlusion > 0) | (np.abs(np.arctan2(y, x)) > view / 2)
+        survive = may_be_missed & (labels[:, 2] <= self.settings.max_missed)
+        return Tracks(labels, tracks.means, tracks.covariances).select(survive)
 
 
 def _unplaced(neighbors: Contacts, messages: Messages) -> NDArray[np.bool_]:
@@ -420,24 +402,42 @@ def _unplaced(neighbors: Contacts, messages: Messages) -> NDArray[np.bool_]:
 
 
 def _joined(*parts: Tracks) -> Tracks:
-    """Tracks together, in the order of the vehicles that track, then of the bodies."""
-    joined = Tracks(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(Tracks)))
-    return joined.select(np.lexsort((joined.bodies, joined.observers)))
+    """Tracks together, in the order of their series, then of the bodies."""
+    columns = zip(*((part.labels, part.means, part.covariances) for part in parts), strict=True)
+    joined = Tracks(*(np.concatenate(column) for column in columns))
+    return joined.select(np.lexsort((joined.labels[:, 1], joined.labels[:, 0])))
 
 
-def _moved(poses: NDArray[np.float64], ego_motion: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Poses ``(..., 3)`` [m, m, rad] after an :attr:`~sb3_flock.sim.Sensing.ego_motion`."""
-    left = ego_motion[..., 2] if ego_motion.shape[-1] > 2 else np.zeros(ego_motion.shape[:-1])
-    places = _to_odometry(np.stack((ego_motion[..., 0], left), axis=-1), poses)
-    return np.concatenate((places, (poses[..., 2] + ego_motion[..., 1])[..., None]), axis=-1)
+def _at(history: Sequence[NDArray[np.float64]], ages: NDArray[np.int64]) -> NDArray[np.float64]:
+    """The rows of some steps ago, or of the oldest: ``ages`` has the number of steps for each."""
+    last = len(history) - 1
+    ages = np.minimum(ages, last)
+    if (ages == ages[0]).all():
+        return history[last - int(ages[0])]
+    return np.stack(list(history))[last - ages, np.arange(len(ages))]
+
+
+def _turned(directions: NDArray[np.float64], angles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Unit vectors ``(..., 2)`` turned to the left by angles ``(...)`` [rad]."""
+    cos, sin, x, y = np.cos(angles), np.sin(angles), directions[..., 0], directions[..., 1]
+    return np.stack((cos * x - sin * y, sin * x + cos * y), axis=-1)
+
+
+def _moved(poses: NDArray[np.float64], motion: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Poses ``(vehicles, 4)``, position [m] and the heading's cosine and sine, after an ego-motion ``(vehicles, 2 or 3)``."""
+    left = motion[:, 2] if motion.shape[1] > 2 else np.zeros(len(motion))
+    places = _to_odometry(np.stack((motion[:, 0], left), axis=-1), poses)
+    return np.concatenate((places, _turned(poses[:, 2:], motion[:, 1])), axis=-1)
 
 
 def _to_odometry(positions: NDArray[np.float64], poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Positions in body frames ``(..., 2)`` [m], in the odometry frame in which the bodies have the poses ``(..., 3)``."""
-    back = np.stack((np.cos(poses[..., 2]), -np.sin(poses[..., 2])), axis=-1)
-    return poses[..., :2] + to_body(positions, back)
+    """Positions in body frames ``(any, 2)`` [m], in the odometry frame in which the bodies have the poses ``(any, 4)``."""
+    (x, y), (at_x, at_y, cos, sin) = positions.T, poses.T
+    return np.stack((at_x + cos * x - sin * y, at_y + sin * x + cos * y), axis=-1)
 
 
 def _to_body(positions: NDArray[np.float64], poses: NDArray[np.float64]) -> NDArray[np.float64]:
     """The inverse of :func:`_to_odometry`."""
-    return to_body(positions - poses[..., :2], np.stack((np.cos(poses[..., 2]), np.sin(poses[..., 2])), axis=-1))
+    (x, y), (at_x, at_y, cos, sin) = positions.T, poses.T
+    x, y = x - at_x, y - at_y
+    return np.stack((cos * x + sin * y, cos * y - sin * x), axis=-1)
