@@ -145,12 +145,12 @@ class Sensors:
         measured = truth if self.is_exact else self._with_errors(truth)
         if self._tracker is not None:
             self._measured.append(measured)
-            self._estimate = self._tracker.update(self._delayed(), measured.ego_motion, self._messages(truth, measured))
+            self._estimate = self._tracker.update(self.delayed(), measured.ego_motion, self._messages(truth, measured))
             return self._with_previous(self._estimate) if has_memory else self._estimate
         if has_memory:
             measured = self._with_previous(measured)
         self._measured.append(measured)
-        return self._delayed()
+        return self.delayed()
 
     def _messages(self, truth: Sensing, measured: Sensing) -> Messages | None:
         """What neighbors share for the tracker: vehicles in link range communicate, whether they see each other or not."""
@@ -160,7 +160,7 @@ class Sensors:
             raise ValueError("bodies = None: shared_motion needs to know the headings of all vehicles")
         return Messages(self._bodies().frames, measured.ego_motion, truth.neighbors.observers, truth.neighbors.bodies)
 
-    def _delayed(self) -> Sensing:
+    def delayed(self) -> Sensing:
         """What is used now: what was measured before the delay, or first."""
         last = len(self._measured) - 1
         ages = np.minimum(self._delays, last)
@@ -186,7 +186,7 @@ class Sensors:
         for kept, saved in ((self._history, state["history"]), (self._measured, state["measured"])):
             kept.clear()
             kept.extend(_sensing(sensing) for sensing in saved)
-        self.latest = self._delayed() if self._measured else None
+        self.latest = self.delayed() if self._measured else None
         self._estimate = None
         if self._tracker is not None and "tracker" in state:
             self._tracker.load_state_dict(state["tracker"])

@@ -8,7 +8,6 @@ associate them with tracks (Bar-Shalom, Li and Kirubarajan: Estimation with Appl
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -41,7 +40,8 @@ class TrackerSettings(Settings):
     """The estimation on board; off by default, as in the paper."""
 
     enabled: bool = Field(
-        False, description="vehicles track what they sense, and act on the estimates instead of the measurements (paper: false)"
+        False,
+        description="vehicles track what they sense, and act on the estimates instead of the measurements (paper: false)",
     )
     neighbor_acceleration: Positive | None = Field(
         None,
@@ -97,8 +97,8 @@ class Messages(NamedTuple):
 class Tracks:
     """Tracked bodies: one row a track, in the order of their series.
 
-    A series is one kind of bodies that one vehicle tracks. Series number k n + i is that of kind k and vehicle i, of n vehicles of
-    all flocks. The covariance of a track is the same along both axes, without correlation between them.
+    A series is one kind of bodies that one vehicle tracks. Series number k n + i is that of kind k and vehicle i, of n vehicles
+    in all flocks. The covariance of a track is the same along both axes, without correlation between them.
     """
 
     labels: NDArray[np.int64]
@@ -113,7 +113,7 @@ class Tracks:
         """Some of the tracks."""
         return Tracks(self.labels[rows], self.means[rows], self.covariances[rows])
 
-    def predict(self, times: NDArray[np.float64] | float, intensities: NDArray[np.float64]) -> Tracks:
+    def predict(self, times: NDArray[np.floating] | float, intensities: NDArray[np.float64]) -> Tracks:
         """The tracks some time later: constant velocity, disturbed by white noise of the acceleration.
 
         :param times: ``(tracks,)`` [s], or one for all
@@ -196,7 +196,8 @@ class Tracker:
 
     Detections and waypoint are those of the sensors' delay ago; odometry and messages have no delay. A detection that no track
     takes starts a track. A track that takes none survives ``max_missed`` steps, or none where the sensors miss nothing that is in
-    their field of view. The waypoint has one track, which takes every measurement.
+    their field of view. The waypoint has one track, which takes every measurement. With ``shared_motion`` a track of a neighbor
+    belongs to the messages of the vehicle whose detection it took last.
 
     :param settings: the tracker's settings, the bounds of the bodies' motion, and the time step
     :param ranges: how far vehicles sense
@@ -209,7 +210,10 @@ class Tracker:
         neighbor, obstacle = own.neighbor_acceleration, own.obstacle_acceleration
         neighbor = speed * settings.max_turn_rate if neighbor is None else neighbor
         obstacle = obstacle_speed * settings.obstacle_turn_std if obstacle is None else obstacle
-        speeds, accelerations = np.array([speed, obstacle_speed, speed]), np.array([neighbor, obstacle, speed / _WAYPOINT_TIME])
+        speeds, accelerations = (
+            np.array([speed, obstacle_speed, speed]),
+            np.array([neighbor, obstacle, speed / _WAYPOINT_TIME]),
+        )
         if own.shared_motion:
             speeds[0] = accelerations[0] = 0.0  # no velocity of a neighbor is estimated
         self._ranges = np.array([ranges.link_range, ranges.known_obstacle_range, np.inf])
@@ -221,16 +225,22 @@ class Tracker:
         self._delays = np.rint(delay[:, 0] / self.time_step).astype(np.int64)
         noise = errors.position_noise if own.assumed_noise is None else np.full((1, 1), own.assumed_noise)
         self._variances = np.square(noise[:, 0])
-        longest = int(self._delays.max())
-        self._poses: deque[NDArray[np.float64]] = deque(maxlen=1 + longest)
-        self._ways: deque[NDArray[np.float64]] = deque(maxlen=2 + longest)
+        self._poses: deque[NDArray[np.float64]] = deque(maxlen=1 + self.delay_steps)
+        self._ways: deque[NDArray[np.float64]] = deque(maxlen=2 + self.delay_steps)
+        self._heard = np.empty((2, 0), np.int64)
         self.reset()
+
+    @property
+    def delay_steps(self) -> int:
+        """The longest delay of any flock's detections [steps]."""
+        return int(self._delays.max())
 
     def reset(self) -> None:
         """Drop all tracks."""
         self._steps, self.tracks, self._shape = 0, _NONE, (0, 0)
         self._poses.clear()
         self._ways.clear()
+        self._heard = self._heard[:, :0]
 
     def update(self, measured: Sensing, ego_motion: NDArray[np.float64], messages: Messages | None = None) -> Sensing:
         """Take a measurement, once a step, and estimate where the bodies are now.
@@ -250,16 +260,25 @@ class Tracker:
             if messages is None:
                 raise ValueError("messages = None: shared_motion needs what the neighbors share")
             frames = self._take(messages)
+            self._end_unheard(messages)
         is_new = np.broadcast_to((self._steps == 0) | (self._steps > self._delays), (n_flocks,))
         ages = np.broadcast_to(np.minimum(self._delays, self._steps), (n_flocks,)).repeat(vehicles)
         if is_new.any():
             self._correct(measured, motion, frames, ages, is_new)
+            if messages is not None and frames is not None:
+                self._end_unheard(messages)
         self._steps += 1
         return self._now(ego_motion, frames, ages, messages)
 
     def state_dict(self) -> dict[str, Any]:
         """The tracks and the odometry: plain values and arrays."""
-        return {"steps": self._steps, "poses": list(self._poses), "ways": list(self._ways), "tracks": dict(vars(self.tracks))}
+        return {
+            "steps": self._steps,
+            "poses": list(self._poses),
+            "ways": list(self._ways),
+            "heard": self._heard,
+            "tracks": dict(vars(self.tracks)),
+        }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore :meth:`state_dict`."""
@@ -267,6 +286,7 @@ class Tracker:
         self._steps = int(state["steps"])
         self._poses.extend(np.array(pose) for pose in state["poses"])
         self._ways.extend(np.array(way) for way in state["ways"])
+        self._heard = np.array(state["heard"])
         self.tracks = Tracks(**state["tracks"])
 
     def _take(self, messages: Messages) -> NDArray[np.float64]:
@@ -282,6 +302,12 @@ class Tracker:
         self._ways.append(self._ways[-1] + way if self._ways else np.zeros_like(way))
         (cos, sin), (own_cos, own_sin) = headings.T, self._poses[-1][:, 2:].T
         return np.stack((cos * own_cos + sin * own_sin, sin * own_cos - cos * own_sin), axis=-1)
+
+    def _end_unheard(self, messages: Messages) -> None:
+        """End the tracks of neighbors whose messages are not received: they are out of link range."""
+        series, senders = self.tracks.labels[:, 0], self.tracks.labels[:, 1]
+        is_heard = np.isin(series * self._shape[1] + senders, messages.receivers * self._shape[1] + messages.senders)
+        self.tracks = self.tracks.select(is_heard | (series >= len(self._poses[-1])))
 
     def _correct(
         self,
@@ -345,7 +371,7 @@ class Tracker:
             Contacts(shape, *(column[near & (kinds == kind)] for column in columns)) for kind in range(2)
         )
         waypoint = slice(len(kinds) - size, None)
-        unplaced = None if messages is None or frames is None else _unplaced(neighbors, messages)
+        unplaced = None if messages is None or frames is None else self._unplaced(neighbors, messages)
         places, ways = positions[waypoint].reshape(*shape, 2), distances[waypoint].reshape(shape)
         return Sensing(neighbors, obstacles, places, ways, ego_motion, unplaced=unplaced)
 
@@ -367,9 +393,7 @@ class Tracker:
             tracks.covariances[:rows, 0] += relative * (np.square(ways[:, 0]) + np.square(ways[:, 1]))
         return tracks
 
-    def _drift(
-        self, tracks: Tracks, poses: NDArray[np.float64], motion: NDArray[np.float64]
-    ) -> NDArray[np.float64] | float:
+    def _drift(self, tracks: Tracks, poses: NDArray[np.float64], motion: NDArray[np.float64]) -> NDArray[np.float64] | float:
         """Variance that errors of a vehicle's own odometry in a step give to its tracks, ``(tracks,)`` [m^2]."""
         if not self._errors.is_on("odometry_noise"):
             return 0.0
@@ -392,13 +416,21 @@ class Tracker:
         survive = may_be_missed & (labels[:, 2] <= self.settings.max_missed)
         return Tracks(labels, tracks.means, tracks.covariances).select(survive)
 
+    def _unplaced(self, neighbors: Contacts, messages: Messages) -> NDArray[np.bool_]:
+        """Which vehicles receive messages of a neighbor that none of their tracks is of, ``(vehicles of all flocks,)``.
 
-def _unplaced(neighbors: Contacts, messages: Messages) -> NDArray[np.bool_]:
-    """Which vehicles receive a message of a neighbor that none of their tracks is of, ``(vehicles of all flocks,)``."""
-    flocks, vehicles = neighbors.shape
-    tracked = neighbors.observers * vehicles + neighbors.bodies
-    is_unknown = ~np.isin(messages.receivers * vehicles + messages.senders, tracked)
-    return np.bincount(messages.receivers[is_unknown], minlength=flocks * vehicles) > 0
+        A neighbor that is not detected in the time that the sensors need is out of view, and does not count any more.
+        """
+        n_flocks, vehicles = neighbors.shape
+        pairs, steps = messages.receivers * vehicles + messages.senders, np.zeros(len(messages.receivers), np.int64)
+        known, at = np.isin(pairs, self._heard[0]), np.searchsorted(self._heard[0], pairs)
+        steps[known] = self._heard[1, at[known]] + 1
+        self._heard = np.stack((pairs, steps))
+        misses = np.where(self._errors.of_flocks("dropout", n_flocks) > 0, self.settings.max_missed, 0)
+        patience = np.broadcast_to(self._delays, (n_flocks,)) + misses
+        counts = steps < patience[messages.receivers // vehicles]
+        counts &= ~np.isin(pairs, neighbors.observers * vehicles + neighbors.bodies)
+        return np.bincount(messages.receivers[counts], minlength=n_flocks * vehicles) > 0
 
 
 def _joined(*parts: Tracks) -> Tracks:
