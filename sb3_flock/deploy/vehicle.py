@@ -113,7 +113,9 @@ class VehicleController:
         self.waypoint = Body("the waypoint", scenario.waypoint_speed)
         self._announcing = self.scenario.replace(safety_filter="heading") if self.announces else self.scenario
         self._sensors = Sensors(self.scenario.replace(tracker=TrackerSettings()), self.scenario)
-        self._tracker = Tracker(scenario, scenario, FlockValues(scenario.sensors)) if scenario.tracker.enabled else None
+        self._tracker = None
+        if scenario.tracker.enabled:
+            self._tracker = Tracker(scenario.tracker, scenario, scenario, FlockValues(scenario.sensors))
         self._own_poses: deque[NDArray[np.float64]] = deque(maxlen=1 + (self._tracker.delay_steps if self._tracker else 0))
         self._bounds = (0.0, -scenario.max_turn_rate), (scenario.max_speed, scenario.max_turn_rate)
         self._before: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None

@@ -87,7 +87,7 @@ class Sensors:
     Neighbors and obstacles are detected within the field of view and where no other body hides them. The waypoint is always
     known. With ``shared_detections`` a vehicle also knows the obstacles that a neighbor detects in the neighbor's own field of
     view; vehicles within ``link_range`` communicate whether they see each other or not. Then come missed detections and noise,
-    also of what is shared.
+    also of what is shared. Where the settings have a tracker, vehicles act on its estimates.
 
     :param settings: the errors and the motion lag
     :param ranges: how far vehicles sense, and whether detections are shared
@@ -115,7 +115,8 @@ class Sensors:
         self.is_exact = self.settings.sensors == SensorErrors() and not errors.are_drawn
         self._delays = np.rint(errors.delay[:, 0] / self.settings.time_step).astype(np.int64)
         self._measured: deque[Sensing] = deque(maxlen=1 + int(self._delays.max()))
-        self._tracker = Tracker(self.settings, self.ranges, errors) if self.settings.tracker.enabled else None
+        own = self.settings.tracker
+        self._tracker = Tracker(own, self.settings, self.ranges, errors) if own.enabled else None
         self._estimate: Sensing | None = None
 
     def reset(self, rngs: Sequence[Generator]) -> None:

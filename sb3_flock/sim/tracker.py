@@ -22,9 +22,9 @@ from sb3_flock.sim.sensing import Contacts, Sensing, to_body
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from sb3_flock.sim.dynamics import DynamicsSettings
     from sb3_flock.sim.randomization import FlockValues
     from sb3_flock.sim.sensing import SensingSettings
-    from sb3_flock.sim.sensors import SensorSettings
 
 _WAYPOINT_TIME = 1.0
 """Time in which the waypoint changes its velocity by about the vehicles' top speed [s]."""
@@ -46,7 +46,7 @@ class TrackerSettings(Settings):
     neighbor_acceleration: Positive | None = Field(
         None,
         description="standard deviation of a neighbor's change of velocity in a step, divided by time_step [m/s^2]; "
-        "null: max_speed times max_turn_rate (paper: none)",
+        "null: half of max_speed times max_turn_rate (paper: none)",
     )
     obstacle_acceleration: Positive | None = Field(
         None, description="the same of an obstacle [m/s^2]; null: obstacle_max_speed times obstacle_turn_std (paper: none)"
@@ -199,21 +199,22 @@ class Tracker:
     their field of view. The waypoint has one track, which takes every measurement. With ``shared_motion`` a track of a neighbor
     belongs to the messages of the vehicle whose detection it took last.
 
-    :param settings: the tracker's settings, the bounds of the bodies' motion, and the time step
+    :param settings: the tracker's settings
+    :param dynamics: the bounds of the bodies' motion, and the time step
     :param ranges: how far vehicles sense
     :param errors: what is known of the sensors' errors, of each flock where they are randomized
     """
 
-    def __init__(self, settings: SensorSettings, ranges: SensingSettings, errors: FlockValues) -> None:
-        own, speed, obstacle_speed = settings.tracker, settings.max_speed, settings.obstacle_max_speed
-        self.settings, self.time_step, self._errors = own, settings.time_step, errors
+    def __init__(
+        self, settings: TrackerSettings, dynamics: DynamicsSettings, ranges: SensingSettings, errors: FlockValues
+    ) -> None:
+        own, speed, obstacle_speed = settings, dynamics.max_speed, dynamics.obstacle_max_speed
+        self.settings, self.time_step, self._errors = settings, dynamics.time_step, errors
         neighbor, obstacle = own.neighbor_acceleration, own.obstacle_acceleration
-        neighbor = speed * settings.max_turn_rate if neighbor is None else neighbor
-        obstacle = obstacle_speed * settings.obstacle_turn_std if obstacle is None else obstacle
-        speeds, accelerations = (
-            np.array([speed, obstacle_speed, speed]),
-            np.array([neighbor, obstacle, speed / _WAYPOINT_TIME]),
-        )
+        neighbor = speed * dynamics.max_turn_rate / 2 if neighbor is None else neighbor
+        obstacle = obstacle_speed * dynamics.obstacle_turn_std if obstacle is None else obstacle
+        accelerations = np.array([neighbor, obstacle, speed / _WAYPOINT_TIME])
+        speeds = np.array([speed, obstacle_speed, speed])
         if own.shared_motion:
             speeds[0] = accelerations[0] = 0.0  # no velocity of a neighbor is estimated
         self._ranges = np.array([ranges.link_range, ranges.known_obstacle_range, np.inf])

@@ -26,7 +26,7 @@ CROWD = Scenario(n_vehicles=6, n_obstacles=3, arena=0.3, obstacle_arena=0.4, mot
 def tracker_of(sensors=None, **settings):
     """A tracker of one vehicle, or of several in flocks of one."""
     scenario = Scenario(n_vehicles=1, sensors=sensors or {}, tracker={"enabled": True, **settings})
-    return Tracker(scenario, scenario, FlockValues(scenario.sensors))
+    return Tracker(scenario.tracker, scenario, scenario, FlockValues(scenario.sensors))
 
 
 def contacts(positions, shape=(1, 1), observers=None, bodies=None):
@@ -141,7 +141,7 @@ def test_estimates_are_consistent():
         n_vehicles=1, obstacle_max_speed=0.2, detection_range=100.0, sensors={"position_noise": noise, "dropout": 1e-9},
         tracker={"enabled": True, "obstacle_acceleration": acceleration, "gate": 100.0},
     )  # fmt: skip
-    tracker = Tracker(scenario, scenario, FlockValues(scenario.sensors))
+    tracker = Tracker(scenario.tracker, scenario, scenario, FlockValues(scenario.sensors))
     intensity = acceleration**2 * dt
     spread = np.linalg.cholesky(intensity * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]]))
     positions, velocities = rng.normal(size=(n, 2)), rng.normal(0, 0.1, (n, 2))
@@ -346,7 +346,7 @@ def heard(*senders):
 )
 def test_a_neighbor_that_is_not_detected_in_time_is_out_of_view(sensors, patience):
     scenario = Scenario(n_vehicles=2, sensors=sensors, tracker={"enabled": True, "shared_motion": True})
-    tracker = Tracker(scenario, scenario, FlockValues(scenario.sensors))
+    tracker = Tracker(scenario.tracker, scenario, scenario, FlockValues(scenario.sensors))
     none, waypoints = contacts(np.empty((0, 2)), (1, 2)), np.zeros((1, 2, 2))
     nothing = Sensing(none, none, waypoints, waypoints[..., 0], np.zeros((1, 2, 2)))
     assert not tracker.update(nothing, np.zeros((1, 2, 2)), heard()).unplaced.any()
