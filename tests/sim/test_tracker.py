@@ -15,6 +15,7 @@ from sb3_flock.settings import SettingsError
 from sb3_flock.sim import Contacts, Sensing, World, episode_rng
 from sb3_flock.sim.randomization import FlockValues
 from sb3_flock.sim.safety import filter_actions
+from sb3_flock.sim.sensors import Sensors
 from sb3_flock.sim.tracker import Messages, Tracker, Tracks, associate
 from tests.helpers import assert_copy_continues_alike, place
 
@@ -125,9 +126,15 @@ def test_shared_motion_needs_no_velocity():
         compared += same.sum()
         truth, _ = world.step(rng.uniform(world.action_low, world.action_high, (4, 6, 2)))
     assert compared > 200
+
+
+def test_shared_motion_needs_messages_and_headings():
     tracker = tracker_of(shared_motion=True)
     with pytest.raises(ValueError, match="shared_motion needs what the neighbors share"):
         tracker.update(sensed(), still())
+    scenario = Scenario(n_vehicles=1, tracker={"enabled": True, "shared_motion": True})
+    with pytest.raises(ValueError, match="shared_motion needs to know the headings"):
+        Sensors(scenario, scenario).measure(sensed())
 
 
 # Statistics.
