@@ -12,6 +12,7 @@ from sb3_flock.sim import Scenario, Sensing, World, episode_rng, observe
 from sb3_flock.sim.safety import filter_actions
 from sb3_flock.sim.sensing import find_contacts
 from sb3_flock.sim.sensors import SensorErrors
+from sb3_flock.sim.tracker import TrackerSettings
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -88,8 +89,9 @@ def _random_samples(scenario: Scenario, count: int, seed: int) -> Iterator[_Samp
         n_vehicles, n_obstacles = int(rng.integers(1, 13)), int(rng.integers(0, 6))
         bodies = {"n_vehicles": n_vehicles, "n_obstacles": n_obstacles, "obstacle_motion": "walk"}
         arena = max(scenario.link_range, scenario.detection_range) * rng.uniform(2, 5)
-        free_space = {"arena": arena, "obstacle_arena": arena, "obstacle_starts": None, "sensors": SensorErrors()}
-        world = World(scenario.replace(**bodies, **free_space, max_cycles=max(1, scenario.motion_lag_steps)))
+        free_space = {"arena": arena, "obstacle_arena": arena, "obstacle_starts": None}
+        exact = scenario.replace(sensors=SensorErrors(), tracker=TrackerSettings())
+        world = World(exact.replace(**bodies, **free_space, max_cycles=max(1, scenario.motion_lag_steps)))
         sensing = world.sensors.measure(world.reset([rng]))
         inputs = _measured_by_first_vehicle(world, sensing)
         if scenario.motion_lag:

@@ -303,6 +303,13 @@ _INPUTS_OF_LEVELS = {
 """What the metadata says about the inputs of the safety filter."""
 
 
+_ESTIMATES = (
+    "positions are those that a tracker in front of this file estimates for now, as sb3_flock.sim.tracker does; the filter in "
+    "this file keeps nothing for their uncertainty beyond safety_margin"
+)
+"""What the metadata says where the scenario has a tracker."""
+
+
 def _metadata(policy: LoadedPolicy, scenario: Scenario) -> dict[str, Any]:
     inputs = "positions in the body frame [m], forward +x, left +y: neighbors (any, 2), obstacles (any, 2), waypoint (2,)"
     if scenario.shared_detections:
@@ -324,7 +331,8 @@ def metadata_of(policy: LoadedPolicy, scenario: Scenario) -> dict[str, Any]:
     names += ["time_step", "max_speed", "max_turn_rate", "motion_lag"]
     if scenario.is_filtered:
         names += ["safety_filter", "obstacle_filter", "safety_margin", "obstacle_max_speed"]
-    return {**policy.describe(), "policy": policy.path.name, **{name: getattr(scenario, name) for name in names}}
+    tracker = {"estimates": _ESTIMATES} if scenario.tracker.enabled else {}
+    return {**policy.describe(), "policy": policy.path.name, **{name: getattr(scenario, name) for name in names}, **tracker}
 
 
 @contextlib.contextmanager

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,11 +13,14 @@ from numpy.typing import NDArray
 
 from sb3_flock.evaluation.rollout import as_controller
 from sb3_flock.settings import SettingsError
-from sb3_flock.sim import Scenario, Sensing, observe
+from sb3_flock.sim import Contacts, Scenario, Sensing, observe
 from sb3_flock.sim.dynamics import directions_of, wrap_angle
+from sb3_flock.sim.randomization import FlockValues
 from sb3_flock.sim.safety import filter_actions
 from sb3_flock.sim.sensing import sense
 from sb3_flock.sim.sensors import SensorErrors, Sensors
+from sb3_flock.sim.tracker import Messages, Tracker, TrackerSettings
+from sb3_flock.sim.visibility import select
 
 STOP = (0.0, 0.0)
 """The action of a vehicle that stands still: speed [m/s] and turn rate [rad/s]."""
@@ -57,11 +61,36 @@ class Body:
         return now - self.measured if now >= self.measured else math.inf
 
 
+@dataclass
+class Measurement:
+    """What one vehicle measures, and what the others share with it by communication.
+
+    Positions are in the vehicle's own frame when its sensors measured, ``sensors.delay`` ago: forward is +x, left is +y. Odometry
+    and messages are those of now.
+    """
+
+    neighbors: NDArray[np.float64]
+    """Detected vehicles, ``(any, 2)`` [m]."""
+    senders: NDArray[np.int64]
+    """The number of the vehicle from which messages come from there, ``(any,)``, ascending. No position is estimated by it."""
+    obstacles: NDArray[np.float64]
+    """Detected obstacles, and with ``shared_detections`` those that neighbors detect, ``(any, 2)`` [m]."""
+    waypoint: NDArray[np.float64]
+    """``(2,)`` [m]."""
+    ego_motion: NDArray[np.float64]
+    """Since the last cycle: forward [m], turn [rad], and to the left [m], ``(3,)``."""
+    headings: NDArray[np.float64]
+    """Of all vehicles, the own one, too, in any frame that they share, ``(vehicles,)`` [rad]; of one out of range any number."""
+    motions: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
+    """With ``tracker.shared_motion`` the ego-motion of each neighbor whose message was received, by number."""
+
+
 class VehicleController:
     """What one vehicle of a flock does: poses in, speed and turn rate out.
 
     Everything is computed as the world and an evaluation compute it for this vehicle. Its sensors are exact: errors are those of
-    the poses. The vehicle's ego-motion is taken from its own poses.
+    the poses. The vehicle's ego-motion is taken from its own poses. Where the scenario has a tracker, the vehicle acts on the
+    tracker's estimates; ``sensors`` says which errors the tracker expects.
 
     A cycle is :meth:`reason_to_stop`, :meth:`ask`, and :meth:`act`. All times are those of one clock that never goes back [s].
 
@@ -83,7 +112,11 @@ class VehicleController:
         self.obstacles = [Body(f"obstacle {number}", scenario.obstacle_max_speed) for number in range(scenario.n_obstacles)]
         self.waypoint = Body("the waypoint", scenario.waypoint_speed)
         self._announcing = self.scenario.replace(safety_filter="heading") if self.announces else self.scenario
-        self._sensors = Sensors(self.scenario, self.scenario)
+        self._sensors = Sensors(self.scenario.replace(tracker=TrackerSettings()), self.scenario)
+        self._tracker = None
+        if scenario.tracker.enabled:
+            self._tracker = Tracker(scenario.tracker, scenario, scenario, FlockValues(scenario.sensors))
+        self._own_poses: deque[NDArray[np.float64]] = deque(maxlen=1 + (self._tracker.delay_steps if self._tracker else 0))
         self._bounds = (0.0, -scenario.max_turn_rate), (scenario.max_speed, scenario.max_turn_rate)
         self._before: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
         self._cycle: tuple[NDArray[np.float64], Sensing, NDArray[np.float64]] | None = None
@@ -138,12 +171,48 @@ class VehicleController:
         """When the first pose that is not lost is lost if nothing is received; infinite without one [s]."""
         return min((body.measured + self.timeout for body in self.bodies if body.age(now) <= self.timeout), default=math.inf)
 
-    def ask(self) -> float:
+    def ask(self, measurement: Measurement | None = None) -> float:
         """Sense, and ask the policy for an action.
 
+        :param measurement: what the vehicle measures; ``None``: the poses that were received. With a tracker, the poses of other
+            bodies are then taken as those of ``sensors.delay`` ago, and the own one as that of now
         :return: the speed to announce [m/s], that of the action if the vehicles do not announce any
         :raises ValueError: if the policy's action is not finite
         """
+        truth, frames, messages = self._from_poses() if measurement is None else self._from(measurement)
+        if self._tracker is not None:
+            truth = self._tracker.update(truth, truth.ego_motion, messages)
+        sensing = self._sensors.measure(truth)
+        observation = observe(sensing, self.scenario)[0, self.vehicle]
+        actions = np.zeros((1, len(self.vehicles), 2))
+        asked = self.policy.predict(observation, deterministic=True)[0]
+        if not np.isfinite(asked).all():
+            raise ValueError(f"the policy's action is not finite: {asked.tolist()}")
+        actions[0, self.vehicle] = np.clip(asked, *self._bounds)
+        self._cycle = (actions, sensing, frames)
+        return float(filter_actions(actions, sensing, self._announcing, frames)[0, self.vehicle, 0])
+
+    def _from(self, measurement: Measurement) -> tuple[Sensing, NDArray[np.float64], Messages]:
+        """What the vehicle senses, the frames of all vehicles, and what neighbors share."""
+        shape = (1, len(self.vehicles))
+        waypoints, motions = np.zeros((*shape, 2)), np.zeros((*shape, 3))
+        waypoints[0, self.vehicle] = measurement.waypoint
+        for number, motion in measurement.motions.items():
+            motions[0, number, : len(motion)] = motion
+        motions[0, self.vehicle, : len(measurement.ego_motion)] = measurement.ego_motion
+        neighbors = self._contacts(measurement.neighbors, measurement.senders)
+        obstacles = self._contacts(measurement.obstacles, np.arange(len(measurement.obstacles)))
+        frames, senders = directions_of(measurement.headings[None]), np.array(sorted(measurement.motions), dtype=np.int64)
+        messages = Messages(frames, motions, np.full(len(senders), self.vehicle), senders)
+        return Sensing(neighbors, obstacles, waypoints, np.hypot(*np.moveaxis(waypoints, -1, 0)), motions), frames, messages
+
+    def _contacts(self, positions: NDArray[np.float64], bodies: NDArray[np.int64]) -> Contacts:
+        """Bodies that this vehicle detects."""
+        observers = np.full(len(bodies), self.vehicle)
+        return Contacts((1, len(self.vehicles)), observers, bodies, positions, np.hypot(positions[:, 0], positions[:, 1]))
+
+    def _from_poses(self) -> tuple[Sensing, NDArray[np.float64], Messages]:
+        """What the vehicle senses by the poses, the frames of all vehicles, and what neighbors share by their poses."""
         positions, obstacles, waypoints = (
             np.array([(body.x, body.y) for body in bodies], dtype=np.float64).reshape(1, -1, 2)
             for bodies in (self.vehicles, self.obstacles, [self.waypoint])
@@ -151,16 +220,15 @@ class VehicleController:
         headings = np.array([[body.heading for body in self.vehicles]], dtype=np.float64)
         frames = directions_of(headings)
         ego_motion = self._ego_motion(positions, headings)
-        truth = sense(positions, frames, obstacles, waypoints[0], self.scenario, ego_motion)
-        sensing = self._sensors.measure(truth)
-        observation = observe(sensing, self.scenario)[0, self.vehicle]
-        actions = np.zeros_like(positions)
-        asked = self.policy.predict(observation, deterministic=True)[0]
-        if not np.isfinite(asked).all():
-            raise ValueError(f"the policy's action is not finite: {asked.tolist()}")
-        actions[0, self.vehicle] = np.clip(asked, *self._bounds)
-        self._before, self._cycle = (positions, headings), (actions, sensing, frames)
-        return float(filter_actions(actions, sensing, self._announcing, frames)[0, self.vehicle, 0])
+        self._before = (positions.copy(), headings)
+        sensed_from = frames.copy()
+        if self._tracker is not None:  # the others' poses are late
+            self._own_poses.append(np.concatenate((positions[0, self.vehicle], frames[0, self.vehicle])))
+            positions[0, self.vehicle], sensed_from[0, self.vehicle] = np.split(self._own_poses[0], 2)
+        truth = sense(positions, sensed_from, obstacles, waypoints[0], self.scenario, ego_motion)
+        neighbors, known = (_of(contacts, self.vehicle) for contacts in (truth.neighbors, truth.obstacles))
+        messages = Messages(frames, truth.ego_motion, neighbors.observers, neighbors.bodies)
+        return (truth if self._tracker is None else replace(truth, neighbors=neighbors, obstacles=known)), frames, messages
 
     def neighbors(self) -> list[int]:
         """The vehicles that were in range at the last :meth:`ask`."""
@@ -185,6 +253,9 @@ class VehicleController:
     def forget(self) -> None:
         """Start anew after a stop or a missed cycle: earlier measurements are not used any more."""
         self._sensors.forget()
+        self._own_poses.clear()
+        if self._tracker is not None:
+            self._tracker.reset()
         self._before = self._cycle = None
 
     def _ego_motion(self, positions: NDArray[np.float64], headings: NDArray[np.float64]) -> NDArray[np.float64] | None:
@@ -197,6 +268,11 @@ class VehicleController:
 
     def _describe(self, body: Body) -> str:
         return f"{body.name}: {body.fault or f'no pose for {self.timeout} s'}"
+
+
+def _of(contacts: Contacts, vehicle: int) -> Contacts:
+    """What one vehicle of a single flock senses."""
+    return select(contacts, contacts.observers == vehicle)
 
 
 def heading_of(x: float, y: float, z: float, w: float) -> float:

@@ -47,6 +47,7 @@ def select_flocks(sensing: Sensing, flocks: NDArray[np.int64]) -> Sensing:
         sensing.waypoint_distances[flocks],
         sensing.ego_motion[flocks],
         None if sensing.previous is None else select_flocks(sensing.previous, flocks),
+        None if sensing.unplaced is None else sensing.unplaced.reshape(sensing.ego_motion.shape[:2])[flocks].ravel(),
     )
 
 
@@ -63,4 +64,5 @@ def _select_contacts(contacts: Contacts, flocks: NDArray[np.int64]) -> Contacts:
         bodies=contacts.bodies[kept],
         positions=contacts.positions[kept],
         distances=contacts.distances[kept],
+        stds=None if contacts.stds is None else contacts.stds[kept],
     )

@@ -13,6 +13,7 @@ from sb3_flock.envs.batch import copy_flocks, select_flocks
 from sb3_flock.envs.flocking_v0 import Observation, parallel_env
 from sb3_flock.sim import Scenario, Sensing, World
 from sb3_flock.sim.sensors import SensorErrors, Sensors
+from sb3_flock.sim.tracker import TrackerSettings
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -59,7 +60,7 @@ class ExpertEnv(parallel_env):
         super().__init__(
             scenario, n_flocks=n_flocks, action_repeat=action_repeat, safety=safety, randomization=randomization
         )
-        exact = scenario.replace(sensors=SensorErrors())
+        exact = scenario.replace(sensors=SensorErrors(), tracker=TrackerSettings())
         has_errors = scenario != exact or any(name.startswith("sensors.") for name in self.world.randomization)
         self._exact_sensors = Sensors(exact, exact) if has_errors else None
         acts_for_all = queries or n_flocks == 1

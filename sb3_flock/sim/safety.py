@@ -85,7 +85,9 @@ class SafetySettings(SensingSettings, SensorSettings):
     def guarantee_limits(self) -> tuple[str, ...]:
         """Which parameters end the guarantee of the filter that is on, as ``name = value``; empty if it holds.
 
-        The guarantee also needs starts that keep the separation, and vehicles that are all filtered: ``docs/safety.md``.
+        The last one is the range itself, where two vehicles that come into range at top speed cannot stop apart any more. A
+        tracker lifts no limit: its margin is a number of standard deviations. The guarantee also needs starts that keep the
+        separation, and vehicles that are all filtered: ``docs/safety.md``.
         """
         if not self.is_filtered:
             return ()
@@ -102,7 +104,22 @@ class SafetySettings(SensingSettings, SensorSettings):
                 for field in type(group).model_fields
                 if field not in harmless and getattr(group, field) != getattr(exact, field)
             ]
+        if self.safety_filter != "off" and self.stopping_range > self.link_range:
+            limits.append(f"link_range = {self.link_range:g}, of which two vehicles need {self.stopping_range:.3g} to stop")
         return tuple(limits)
+
+    @property
+    def stopping_range(self) -> float:
+        """How far two vehicles have to sense each other in order to stop apart if they meet head-on at top speed [m].
+
+        Each goes on for one step until the other is in range, for the sensors' delay, and for the way of its stop. Messages
+        (``tracker.shared_motion``) have no delay.
+        """
+        speed, actuators, bound = self.max_speed, self.actuators, self.actuators.max_acceleration
+        is_heard = self.tracker.enabled and self.tracker.shared_motion
+        late = self.time_step + (0.0 if is_heard else self.sensors.delay) + actuators.speed_lag
+        way = speed * late + (0.0 if bound is None else speed * speed / (2 * bound))
+        return self.neighbor_separation + self.safety_margin + 2 * way
 
 
 def filter_actions(
@@ -114,6 +131,10 @@ def filter_actions(
     stopping: Stopping | None = None,
 ) -> NDArray[np.float64]:
     """The actions with their speeds bounded; each vehicle uses what it senses, and with ``announce`` what neighbors announce.
+
+    Of a body whose position is estimated it keeps ``tracker.margin_stds`` standard deviations more. A neighbor that it knows by
+    messages alone came into range in the last step: it is at least ``link_range`` less a step's approach away, straight ahead at
+    the worst.
 
     Vehicles that cannot stop at once keep the way free that they need in order to stop, straight on. That lowers the number of
     violations; the guarantee is for vehicles that stop at once.
@@ -130,7 +151,8 @@ def filter_actions(
     observers, strides, budgets = np.empty(0, np.int64), np.empty(0), np.empty(0)
     neighbors, obstacles = sensing.neighbors, sensing.obstacles
     if settings.safety_filter != "off":
-        gaps = np.maximum(neighbors.distances - settings.neighbor_separation - margin, 0.0)
+        free = neighbors.distances - settings.neighbor_separation - margin
+        gaps = np.maximum(free - _uncertainty(neighbors, settings), 0.0)
         receding = _receding(sensing, settings, frames)
         observers, strides = neighbors.observers, _cosines(neighbors) * dt
         budgets = np.where(receding >= 0, gaps, gaps / 2)
@@ -138,7 +160,14 @@ def filter_actions(
         kept = settings.obstacle_separation + margin + settings.obstacle_max_speed * dt
         observers = np.concatenate((observers, obstacles.observers))
         strides = np.concatenate((strides, _cosines(obstacles) * dt))
-        budgets = np.concatenate((budgets, np.maximum(obstacles.distances - kept, 0.0)))
+        gaps_to_obstacles = obstacles.distances - kept - _uncertainty(obstacles, settings)
+        budgets = np.concatenate((budgets, np.maximum(gaps_to_obstacles, 0.0)))
+    if sensing.unplaced is not None and settings.safety_filter != "off":
+        rows, step = np.flatnonzero(sensing.unplaced), 2 * settings.max_speed * dt
+        gap = max(settings.link_range - step - settings.neighbor_separation - margin, 0.0)
+        observers = np.concatenate((observers, rows))
+        strides = np.concatenate((strides, np.full(len(rows), dt)))
+        budgets = np.concatenate((budgets, np.full(len(rows), gap / 2)))
     rounding = ROUNDING * (margin + max(settings.neighbor_separation, settings.obstacle_separation))
     asked = actions[..., 0].ravel()
 
@@ -215,6 +244,11 @@ def limit_speeds(
     over = np.flatnonzero(strides * limited[observers] > budgets - rounding)
     limited[observers[over]] = floors[observers[over]]
     return limited
+
+
+def _uncertainty(contacts: Contacts, settings: SafetySettings) -> NDArray[np.float64] | float:
+    """What is kept for the uncertainty of estimated positions, ``(contacts,)`` [m]; 0 for measured ones."""
+    return 0.0 if contacts.stds is None else settings.tracker.margin_stds * contacts.stds
 
 
 def _cosines(contacts: Contacts) -> NDArray[np.float64]:

@@ -64,6 +64,8 @@ class Contacts:
     """``(contacts, 2)`` [m], of the body in the observer's frame: forward is +x, left is +y."""
     distances: NDArray[np.float64]
     """``(contacts,)`` [m]."""
+    stds: NDArray[np.float64] | None = None
+    """Standard deviation of each coordinate of an estimated position, ``(contacts,)`` [m]; ``None`` for measured ones."""
 
     def count(self, closer_than: float = np.inf) -> NDArray[np.int64]:
         """How many bodies each vehicle senses nearer than a distance [m] (strictly); ``(flocks, vehicles)``."""
@@ -127,6 +129,9 @@ class Sensing:
     Where vehicles also move to the side, ``(flocks, vehicles, 3)``: the third is to the left [m], before the turn."""
     previous: Sensing | None = None
     """What was sensed ``motion_lag`` ago, in the vehicles' present frames; ``None`` without motion channels."""
+    unplaced: NDArray[np.bool_] | None = None
+    """Whether a vehicle receives messages of a neighbor whose place it does not know yet, ``(vehicles of all flocks,)``; ``None``
+    without a tracker and ``shared_motion``."""
 
     def compensate_ego_motion(self, ego_motion: NDArray[np.float64]) -> Sensing:
         """The same bodies, where they were, in the vehicles' frames after a further :attr:`ego_motion`."""

@@ -16,6 +16,7 @@ from sb3_flock.settings import NotNegative, Settings
 from sb3_flock.sim.dynamics import DynamicsSettings
 from sb3_flock.sim.randomization import FlockValues, own_rngs, rng_states, rngs_of
 from sb3_flock.sim.sensing import Contacts, Sensing
+from sb3_flock.sim.tracker import Messages, Tracker, TrackerSettings
 from sb3_flock.sim.visibility import in_view, known_obstacles, occluded, select
 
 if TYPE_CHECKING:
@@ -64,6 +65,9 @@ class SensorSettings(DynamicsSettings):
         "0: no motion channels (paper: 0)",
     )
     sensors: SensorErrors = Field(default_factory=SensorErrors, description="errors of what vehicles measure (paper: none)")
+    tracker: TrackerSettings = Field(
+        default_factory=TrackerSettings, description="estimation on board from what vehicles measure (paper: none)"
+    )
 
     @model_validator(mode="after")
     def _lag_is_whole_steps(self) -> SensorSettings:
@@ -83,7 +87,7 @@ class Sensors:
     Neighbors and obstacles are detected within the field of view and where no other body hides them. The waypoint is always
     known. With ``shared_detections`` a vehicle also knows the obstacles that a neighbor detects in the neighbor's own field of
     view; vehicles within ``link_range`` communicate whether they see each other or not. Then come missed detections and noise,
-    also of what is shared.
+    also of what is shared. Where the settings have a tracker, vehicles act on its estimates.
 
     :param settings: the errors and the motion lag
     :param ranges: how far vehicles sense, and whether detections are shared
@@ -111,6 +115,9 @@ class Sensors:
         self.is_exact = self.settings.sensors == SensorErrors() and not errors.are_drawn
         self._delays = np.rint(errors.delay[:, 0] / self.settings.time_step).astype(np.int64)
         self._measured: deque[Sensing] = deque(maxlen=1 + int(self._delays.max()))
+        own = self.settings.tracker
+        self._tracker = Tracker(own, self.settings, self.ranges, errors) if own.enabled else None
+        self._estimate: Sensing | None = None
 
     def reset(self, rngs: Sequence[Generator]) -> None:
         """Start an episode; exact sensors draw nothing from the flocks' generators."""
@@ -123,6 +130,9 @@ class Sensors:
         self.latest = None
         self._history.clear()
         self._measured.clear()
+        self._estimate = None
+        if self._tracker is not None:
+            self._tracker.reset()
 
     def measure(self, truth: Sensing) -> Sensing:
         """What the vehicles act on; call this once a step. Until the delay is over, that is the first measurement."""
@@ -131,15 +141,27 @@ class Sensors:
 
     def _measure(self, truth: Sensing) -> Sensing:
         has_memory = self._history.maxlen != 1
-        if self.is_exact and not has_memory:
+        if self.is_exact and not has_memory and self._tracker is None:
             return truth
         measured = truth if self.is_exact else self._with_errors(truth)
+        if self._tracker is not None:
+            self._measured.append(measured)
+            self._estimate = self._tracker.update(self.delayed(), measured.ego_motion, self._messages(truth, measured))
+            return self._with_previous(self._estimate) if has_memory else self._estimate
         if has_memory:
             measured = self._with_previous(measured)
         self._measured.append(measured)
-        return self._delayed()
+        return self.delayed()
 
-    def _delayed(self) -> Sensing:
+    def _messages(self, truth: Sensing, measured: Sensing) -> Messages | None:
+        """What neighbors share for the tracker: vehicles in link range communicate, whether they see each other or not."""
+        if not self.settings.tracker.shared_motion:
+            return None
+        if self._bodies is None:
+            raise ValueError("bodies = None: shared_motion needs to know the headings of all vehicles")
+        return Messages(self._bodies().frames, measured.ego_motion, truth.neighbors.observers, truth.neighbors.bodies)
+
+    def delayed(self) -> Sensing:
         """What is used now: what was measured before the delay, or first."""
         last = len(self._measured) - 1
         ages = np.minimum(self._delays, last)
@@ -149,10 +171,14 @@ class Sensors:
 
     def state_dict(self) -> dict[str, Any]:
         """The random streams, the memory and the delayed measurements: plain values and arrays."""
+        tracker = {}
+        if self._tracker is not None and self._estimate is not None:
+            tracker = {"tracker": self._tracker.state_dict(), "estimate": asdict(self._estimate)}
         return {
             "rngs": rng_states(self._rngs),
             "history": [asdict(sensing) for sensing in self._history],
             "measured": [asdict(sensing) for sensing in self._measured],
+            **tracker,
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -161,7 +187,12 @@ class Sensors:
         for kept, saved in ((self._history, state["history"]), (self._measured, state["measured"])):
             kept.clear()
             kept.extend(_sensing(sensing) for sensing in saved)
-        self.latest = self._delayed() if self._measured else None
+        self.latest = self.delayed() if self._measured else None
+        self._estimate = None
+        if self._tracker is not None and "tracker" in state:
+            self._tracker.load_state_dict(state["tracker"])
+            self._estimate = _sensing(state["estimate"])
+            self.latest = replace(self._estimate, previous=self._history[0] if self._history else None)
 
     def _with_previous(self, measured: Sensing) -> Sensing:
         """Adds what was measured ``motion_lag`` ago, or at the start, in the vehicles' present frames."""

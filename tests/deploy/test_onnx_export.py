@@ -10,7 +10,7 @@ from sb3_flock import load_policy, train
 from sb3_flock.cli import main
 from sb3_flock.deploy import onnx_export
 from sb3_flock.deploy.onnx_check import random_sample_inputs
-from sb3_flock.deploy.onnx_export import INPUTS, PREVIOUS_INPUTS, TOLERANCE, OnnxPolicy, export
+from sb3_flock.deploy.onnx_export import INPUTS, PREVIOUS_INPUTS, TOLERANCE, OnnxPolicy, export, metadata_of
 from sb3_flock.settings import RunError, SettingsError
 from sb3_flock.sim import observation
 from sb3_flock.sim.observation import Channel, register_channel
@@ -110,6 +110,17 @@ def test_a_graph_that_acts_otherwise_is_not_written(policy, tmp_path, monkeypatc
     with pytest.raises(RunError, match="differs from the policy by 0.00016 of the range"):
         export(policy, tmp_path / "policy.onnx", n_samples=3)
     assert not list(tmp_path.iterdir())
+
+
+def test_with_a_tracker_the_graph_is_the_same_and_the_file_says_that_it_takes_estimates(policy):
+    tracked = policy.scenario.replace(tracker={"enabled": True, "assumed_noise": 0.05})
+    for (inputs, shown), (others, other) in zip(
+        random_sample_inputs(policy.scenario, 3, 0), random_sample_inputs(tracked, 3, 0), strict=True
+    ):
+        np.testing.assert_array_equal(shown, other)
+        assert {name: value.tolist() for name, value in inputs.items()} == {n: v.tolist() for n, v in others.items()}
+    assert "a tracker in front of this file" in metadata_of(policy, tracked)["estimates"]
+    assert "estimates" not in metadata_of(policy, policy.scenario)
 
 
 def test_mistakes_are_one_line(policy, tmp_path):

@@ -7,9 +7,10 @@ import pytest
 
 from sb3_flock import Scenario, load_policy
 from sb3_flock.controllers.policy import PolicyController
-from sb3_flock.deploy.vehicle import VehicleController, heading_of
+from sb3_flock.deploy.vehicle import Measurement, VehicleController, heading_of
 from sb3_flock.settings import SettingsError
 from sb3_flock.sim import World, episode_rng
+from sb3_flock.sim.visibility import select
 
 TIMEOUT = 0.15
 LEVELS = ["off", "voronoi", "motion", "heading", "announce"]
@@ -229,3 +230,73 @@ def test_headings_of_quaternions():
     tilted = np.array([math.sin(0.2), 0.0, 0.0, math.cos(0.2)])  # a roll changes no heading
     assert heading_of(*tilted) == 0.0
     assert math.isnan(heading_of(0.0, 0.0, 0.0, 0.0))
+
+
+FIELD = {"position_noise": 0.01, "dropout": 0.1, "delay": 0.1, "odometry_noise": 0.02}
+
+
+def measured_by(vehicle, world, measured, ego_motion):
+    """What one vehicle of a world measures, as :class:`Measurement`."""
+    neighbors, obstacles = (select(found, found.observers == vehicle) for found in (measured.neighbors, measured.obstacles))
+    heard = world.sense().neighbors.by_observer()[vehicle].tolist()
+    return Measurement(
+        neighbors.positions, neighbors.bodies, obstacles.positions, measured.waypoint_positions[0, vehicle],
+        ego_motion[0, vehicle], world.headings[0], {number: ego_motion[0, number] for number in heard},
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("tracker", [{}, {"shared_motion": True}])
+@pytest.mark.parametrize("level", ["motion", "announce"])
+def test_with_a_tracker_the_commands_from_one_vehicles_measurements_are_those_of_the_world(level, tracker):
+    policy = load_policy("flock")
+    scenario = policy.scenario.replace(
+        safety_filter=level, obstacle_filter=True, arena=0.4, sensors=FIELD, tracker={"enabled": True, **tracker}
+    )
+    world = World(scenario)
+    sensing = world.reset([episode_rng(0, 0)])
+    flock = [VehicleController(policy, scenario, number, TIMEOUT) for number in range(scenario.n_vehicles)]
+    limited = 0
+    for _ in range(60):
+        estimate = world.sensors.measure(sensing)
+        detections = world.sensors.delayed()
+        announced = {
+            number: controller.ask(measured_by(number, world, detections, estimate.ego_motion))
+            for number, controller in enumerate(flock)
+        }
+        commands = np.array([controller.act(announced) for controller in flock])
+        asked = PolicyController(policy).act(estimate, scenario)
+        sensing, executed = world.step(asked)
+        limited += (executed[0, :, 0] < asked[0, :, 0] - 1e-6).sum()
+        assert np.abs(commands - executed[0]).max() < ROUNDING
+    assert limited > 5  # the filter had work to do
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.2])
+def test_a_tracker_takes_late_poses_of_the_others(delay):
+    """Where the others go straight on at a constant speed, poses of some time ago give what poses of now give."""
+    settings = {
+        "safety_filter": "announce",
+        "tracker": {"enabled": True, "shared_motion": True},
+        "sensors": {"delay": delay},
+    }
+    controller = placed((0, 0), (0.12, 0), **settings)
+    for step in range(12):
+        late = max(step - round(delay / 0.1), 0)
+        controller.own.receive(0.012 * step, 0.0, 0.0, 0.1 * step)
+        controller.vehicles[1].receive(0.12 + 0.012 * late, 0.0, 0.0, 0.1 * step)
+        controller.waypoint.receive(5.0, 0.0, 0.0, 0.1 * step)
+        controller.ask()
+    assert controller.act({1: 0.12})[0] == pytest.approx(0.15)
+    # without an announcement the gap of 0.02 m in a step is left, which admits 0.2 m/s
+    assert controller.act({})[0] == pytest.approx(0.15)
+
+
+def test_after_a_stop_there_are_no_tracks():
+    controller = placed((0, 0), (0.12, 0), tracker={"enabled": True}, sensors={"dropout": 0.1})
+    controller.ask()
+    controller.vehicles[1].receive(5.0, 0.0, 0.0, 0.0)
+    controller.ask()
+    assert controller.neighbors() == [1]  # it may have been missed
+    controller.forget()
+    controller.ask()
+    assert controller.neighbors() == []

@@ -340,6 +340,7 @@ def test_what_ends_the_guarantee_is_named():
         "actuators.speed_lag = 0.1",
         "actuators.min_speed = 0.05",
         "sensors.position_noise = 0.01",
+        "link_range = 0.15, of which two vehicles need 0.16 to stop",
     )
     assert filtered("voronoi", sensors={"field_of_view": 3.0}).guarantee_limits == ("sensors.field_of_view = 3",)
     assert filtered("voronoi", sensors={"odometry_noise": 0.1}).guarantee_limits == ()

@@ -58,6 +58,7 @@ RANGES = {
         ("ddpg", {"expert": "mpc", "bc_coef": 1.0, "expert_fraction": 0.3}),
         ("ddpg", {"expert": "olfati-saber", "expert_fraction": 0.9, "train_env.flock_sizes": [1, 2]}),
         ("ddpg", {"expert": "orca", "bc_coef": 1.0, "motion_lag": 0.4, "actuators.turn_lag": 0.1, "randomization": RANGES}),
+        ("ddpg", {"motion_lag": 0.4, "tracker.enabled": True, "shared_motion": True, "randomization": RANGES}),
     ],
 )
 def test_a_resumed_run_equals_an_uninterrupted_one_to_the_last_bit(tmp_path, algo, changes):
