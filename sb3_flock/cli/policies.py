@@ -122,7 +122,9 @@ def _print_card(name: str, console: Any) -> None:
         console.print(_results_of_tasks(card))
     if "robustness" in card:
         episodes = card["robustness"]["episodes"]
-        console.print(f"What the policy bears, {episodes} episodes of the task each (`sb3-flock evaluate {name} --robustness`):")
+        console.print(
+            f"What the policy bears, {episodes} episodes of the task each (`sb3-flock evaluate {name} --robustness`):"
+        )
         console.print(_robustness(card))
 
 
