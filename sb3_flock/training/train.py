@@ -369,11 +369,13 @@ def _summary(config: TrainingConfig, model: OffPolicyAlgorithm, folder: Path) ->
     if isinstance(model, FlockTD3) and can_compile(model):
         compiled = f", of the compiled update {model.update_threads},"
     limits = ", ".join(config.scenario.guarantee_limits)
+    drawn = ", ".join(f"{name} {low:g} to {high:g}" for name, (low, high) in config.train_env.randomization.items())
     return (
         f"{config.algo} for {config.scenario.bodies}; training env: {config.n_flocks} flocks of "
         f"{' and of '.join(str(scenario.n_vehicles) for scenario in scenarios)} vehicles, {scenarios[0].n_obstacles} obstacles "
         f"each; device {model.device}, "
         f"torch threads {th.get_num_threads()}{compiled} on {cores()} cores; {folder}"
+        + (f"; drawn for each flock and episode: {drawn}" if drawn else "")
         + (f"; the safety filter guarantees no separation with {limits}" if limits else "")
     )
 

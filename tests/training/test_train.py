@@ -254,3 +254,11 @@ def test_the_first_line_names_what_ends_the_guarantee_of_the_filter(tmp_path, sl
     result = train(tiny(tmp_path, total_timesteps=60, eval_freq=0, n_test_episodes=1, **{"actuators.slip": slip}), console)
     first = console.file.getvalue().splitlines()[0]
     assert first.endswith(f"{result.folder}{limits}")
+
+
+def test_the_first_line_names_what_is_drawn(tmp_path):
+    console = Console(file=io.StringIO(), width=1000)
+    ranges = {"actuators.speed_lag": (0.0, 0.3), "sensors.dropout": (0, 0.1)}
+    train(tiny(tmp_path, total_timesteps=60, eval_freq=0, n_test_episodes=1, randomization=ranges), console)
+    first = console.file.getvalue().splitlines()[0]
+    assert "; drawn for each flock and episode: actuators.speed_lag 0 to 0.3, sensors.dropout 0 to 0.1" in first
