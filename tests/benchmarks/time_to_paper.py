@@ -65,7 +65,12 @@ def train_until_it_holds(
             return self.at is None
 
     with tempfile.TemporaryDirectory() as folder:
-        overrides: dict[str, object] = {"n_vehicles": n_vehicles, "n_obstacles": n_obstacles, "seed": seed, "output_dir": folder}
+        overrides: dict[str, object] = {
+            "n_vehicles": n_vehicles,
+            "n_obstacles": n_obstacles,
+            "seed": seed,
+            "output_dir": folder,
+        }
         if expert is not None:
             overrides["train_env.expert"] = expert
         overrides.update(parse_overrides(changes))
