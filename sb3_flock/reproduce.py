@@ -255,7 +255,7 @@ def _training_curve(folder: Path, policies: Mapping[str, LoadedPolicy]) -> str:
     for name in CURVES:
         curves = [seed["curve"] for seed in read_card(name)["seeds"]]
         series[name] = (np.array(curves[0]["timesteps"]), np.array([curve["tracking_error"] for curve in curves]))
-    save(plot_lines(series, "transitions", "tracking error [m]"), folder / "training")
+    save(plot_lines(series, "transitions", "tracking error [m]", log_y=True), folder / "training")
     bodies = {policies[name].scenario.bodies for name in CURVES}
     return (
         "## Training curves\n\n![tracking error against transitions](training.png)\n\n"

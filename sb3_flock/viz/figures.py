@@ -179,11 +179,14 @@ def plot_lines(
     xlabel: str,
     ylabel: str,
     log_x: bool = False,
+    log_y: bool = False,
     levels: Mapping[str, float] | None = None,
 ) -> Figure:
     """Curves with their spread over the rows (seeds): the median as a line, all rows within the shade.
 
     :param series: label to x, ``(points,)``, and y, ``(rows, points)``
+    :param log_x: logarithmic, with a tick at each point
+    :param log_y: logarithmic
     :param levels: horizontal lines by label
     """
     figure, axes = new_figure(6.0, 4.0)
@@ -199,6 +202,10 @@ def plot_lines(
         points = sorted({float(value) for x, _ in series.values() for value in x})
         axes.set_xticks(points, [f"{value:g}" for value in points])
         axes.set_xticks([], minor=True)
+    if log_y:
+        axes.set_yscale("log")
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_minor_formatter("{x:g}")
     axes.set(xlabel=xlabel, ylabel=ylabel)
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)

@@ -91,3 +91,13 @@ def test_a_figures_file_is_checked_before_the_work(tmp_path, name, message):
     with pytest.raises(SettingsError, match=message):
         check_figure_file(tmp_path / name)
     check_figure_file(tmp_path / "a.svg")
+
+
+def test_a_logarithmic_axis_has_plain_numbers():
+    figure = plot_lines({"a": ([1, 2], np.array([[0.1, 0.9]]))}, "steps", "error", log_y=True)
+    (axes,) = figure.axes
+    assert axes.get_yscale() == "log"
+    figure.canvas.draw()
+    shown = {label.get_text() for label in (*axes.get_yticklabels(), *axes.get_yticklabels(minor=True))}
+    assert "0.1" in shown
+    assert not any("$" in text for text in shown)
