@@ -1,6 +1,7 @@
 import csv
 import functools
 import io
+import shutil
 import zipfile
 
 import numpy as np
@@ -102,30 +103,35 @@ def test_a_complete_run_continues_only_with_more_transitions(tmp_path):
     assert {120, 300, 420} <= set(steps)
 
 
-def test_another_runtime_is_reported(tmp_path):
-    first = train(tiny(tmp_path), quiet())
-    checkpoint = LoadedCheckpoint(checkpoint_paths(first.folder)[-1], 10**9)
-    assert reproducibility_warnings(checkpoint, first.config) == ""
+def test_another_runtime_is_reported(ended):
+    checkpoint = LoadedCheckpoint(checkpoint_paths(ended.folder)[-1], 10**9)
+    assert reproducibility_warnings(checkpoint, ended.config) == ""
     checkpoint.state["runtime_info"]["torch"] = "1.0"
-    assert "; not bit-exact: torch 1.0 then, " in reproducibility_warnings(checkpoint, first.config)
-    assert "worker processes start new episodes" in reproducibility_warnings(checkpoint, first.config.replace(num_cpus=2))
+    assert "; not bit-exact: torch 1.0 then, " in reproducibility_warnings(checkpoint, ended.config)
+    assert "worker processes start new episodes" in reproducibility_warnings(checkpoint, ended.config.replace(num_cpus=2))
+
+
+@pytest.fixture(scope="module")
+def ended(tmp_path_factory):
+    """A training of :data:`TINY` that has ended."""
+    return train(tiny(tmp_path_factory.mktemp("ended")), quiet())
 
 
 @pytest.mark.parametrize(
     "edit",
     [{"gamma": 0.5}, {"reward.lambda_": 0.1}, {"seed": 7}, {"algo": "td3"}, {"features_dim": 24}, {"safety_filter": "off"}],
 )
-def test_an_edited_config_that_changes_what_is_learned_is_refused(tmp_path, edit):
-    first = train(tiny(tmp_path), quiet())
+def test_an_edited_config_that_changes_what_is_learned_is_refused(tmp_path, ended, edit):
+    folder = shutil.copytree(ended.folder, tmp_path / "run")
     ((name, value),) = edit.items()
     whole = ".".join(resolve_path(TrainingConfig, name))
-    edited = load_config(TrainingConfig, overrides={**edit, "total_timesteps": 420}, base=first.config)
-    (first.folder / "config.yaml").write_text(to_yaml(edited))
-    newest = checkpoint_paths(first.folder)[-1].name
+    edited = load_config(TrainingConfig, overrides={**edit, "total_timesteps": 420}, base=ended.config)
+    (folder / "config.yaml").write_text(to_yaml(edited))
+    newest = checkpoint_paths(folder)[-1].name
     with pytest.raises(SettingsError, match=rf"config.yaml: {whole} = {value} \(.* in {newest}\): these cannot change"):
-        resume(first.folder, quiet())
-    assert load_config(TrainingConfig, first.folder / "config.yaml") == edited
-    assert checkpoint_paths(first.folder)[-1].name == newest
+        resume(folder, quiet())
+    assert load_config(TrainingConfig, folder / "config.yaml") == edited
+    assert checkpoint_paths(folder)[-1].name == newest
 
 
 def test_a_resumed_run_says_what_changed_since_its_checkpoint(tmp_path):
@@ -139,12 +145,11 @@ def test_a_resumed_run_says_what_changed_since_its_checkpoint(tmp_path):
     assert line in shown.getvalue()
 
 
-def test_a_checkpoint_that_does_not_fit_its_own_config_is_refused(tmp_path):
-    first = train(tiny(tmp_path), quiet())
-    checkpoint = LoadedCheckpoint(checkpoint_paths(first.folder)[-1], 10**9)
+def test_a_checkpoint_that_does_not_fit_its_own_config_is_refused(ended):
+    checkpoint = LoadedCheckpoint(checkpoint_paths(ended.folder)[-1], 10**9)
     del checkpoint.state["model"]["replay"]
     with pytest.raises(PolicyError, match=r"not a checkpoint of this run's config \('replay'\)"):
-        checkpoint.restore_model(first.model)
+        checkpoint.restore_model(ended.model)
 
 
 def test_what_all_parts_of_a_checkpoint_unpack_to_is_bounded(tmp_path):

@@ -306,6 +306,12 @@ def test_a_damaged_newest_checkpoint_is_skipped(tmp_path, damage):
     assert newest(result.folder).num_timesteps == 600
 
 
+@pytest.fixture(scope="module")
+def ended(tmp_path_factory):
+    """A training that has ended, with two checkpoints."""
+    return train(tiny(tmp_path_factory.mktemp("ended"), total_timesteps=600, save_freq=150), quiet())
+
+
 @pytest.mark.parametrize(
     ("damage", "why"),
     [
@@ -317,9 +323,9 @@ def test_a_damaged_newest_checkpoint_is_skipped(tmp_path, damage):
         (lambda state: state["parts"].pop("metrics"), "parts.metrics: "),
     ],
 )
-def test_a_newest_checkpoint_with_values_that_cannot_be_is_skipped(tmp_path, damage, why):
-    result = train(tiny(tmp_path, total_timesteps=600, save_freq=150), quiet())
-    older, last = checkpoint_paths(result.folder)
+def test_a_newest_checkpoint_with_values_that_cannot_be_is_skipped(tmp_path, ended, damage, why):
+    folder = shutil.copytree(ended.folder, tmp_path / "run")
+    older, last = checkpoint_paths(folder)
     with zipfile.ZipFile(last) as archive:
         members = {name: archive.read(name) for name in archive.namelist()}
     state = json.loads(members["training.json"])
@@ -328,15 +334,15 @@ def test_a_newest_checkpoint_with_values_that_cannot_be_is_skipped(tmp_path, dam
     with zipfile.ZipFile(last, "w") as archive:
         for name, content in members.items():
             archive.writestr(name, content)
-    (result.folder / "final_model.zip").unlink()  # as of a run that did not end
+    (folder / "final_model.zip").unlink()  # as of a run that did not end
     steps = LoadedCheckpoint(older, 10**9).num_timesteps
     console = Console(file=io.StringIO(), width=500)
-    resume(result.folder, console)
+    resume(folder, console)
     skipped, resumed = console.file.getvalue().splitlines()[:2]
     assert skipped.startswith(f"skipped {last}: ")
     assert why in skipped
-    assert resumed.startswith(f"resumes {result.folder} after {steps} of 600 transitions")
-    assert newest(result.folder).num_timesteps == 600
+    assert resumed.startswith(f"resumes {folder} after {steps} of 600 transitions")
+    assert newest(folder).num_timesteps == 600
 
 
 def pause(seconds, tmp_path, start):
