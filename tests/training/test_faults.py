@@ -396,11 +396,10 @@ def test_a_clock_before_1980_is_one_line_and_nothing_is_left(tmp_path, monkeypat
     assert not (tmp_path / "runs").exists()
 
 
-def test_a_folder_whose_name_is_not_utf_8_is_one_line(tmp_path, start):
+def test_a_folder_whose_name_is_not_utf_8_is_one_line(tmp_path):
     folder = os.fsdecode(bytes(tmp_path) + b"/caf\xe9")
-    code, _, errors = start("--output-dir", folder, "--total-timesteps", "10").end()
-    assert code == 2
-    assert errors == f"sb3-flock: {tmp_path}/caf?: TensorBoard needs a name in UTF-8\n"
+    with pytest.raises(SettingsError, match=r"/caf\?: TensorBoard needs a name in UTF-8$"):
+        train(tiny(tmp_path, output_dir=folder), quiet())
     assert not os.path.exists(folder)
 
 
