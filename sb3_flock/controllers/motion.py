@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_flock.sim import Contacts, Scenario
-from sb3_flock.sim.sensing import compensate_ego_motion
+from sb3_flock.sim.sensing import compensate_ego_motion, rotate  # noqa: F401 - rotate was here in the previous release
 
 
 def steer(velocities: NDArray[np.float64], scenario: Scenario) -> NDArray[np.float64]:
@@ -32,13 +32,6 @@ def steer(velocities: NDArray[np.float64], scenario: Scenario) -> NDArray[np.flo
 def limit(vectors: NDArray[np.float64], length: float) -> NDArray[np.float64]:
     """The vectors ``(..., 2)``, shortened to a length where they exceed it."""
     return vectors * np.minimum(1.0, length / np.maximum(np.hypot(vectors[..., 0], vectors[..., 1]), 1e-12))[..., None]
-
-
-def rotate(vectors: NDArray[np.float64], angles: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Vectors ``(..., 2)`` turned by angles ``(...)`` [rad]."""
-    cos, sin = np.cos(angles), np.sin(angles)
-    x, y = vectors[..., 0], vectors[..., 1]
-    return np.stack((cos * x - sin * y, sin * x + cos * y), axis=-1)
 
 
 class Velocities:

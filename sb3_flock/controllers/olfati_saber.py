@@ -11,9 +11,9 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from sb3_flock.controllers.base import Controller, register_controller, register_expert
-from sb3_flock.controllers.motion import Velocities, limit, rotate, steer
+from sb3_flock.controllers.motion import Velocities, limit, steer
 from sb3_flock.sim import Contacts, Scenario, Sensing
-from sb3_flock.sim.sensing import compensate_ego_motion
+from sb3_flock.sim.sensing import compensate_ego_motion, rotate
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,10 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from sb3_flock.controllers.base import Controller, register_controller, register_expert
-from sb3_flock.controllers.motion import Velocities, limit, rotate, steer
+from sb3_flock.controllers.motion import Velocities, limit, steer
 from sb3_flock.settings import SettingsError
 from sb3_flock.sim import Scenario, Sensing
+from sb3_flock.sim.sensing import rotate
 
 
 @dataclass(frozen=True)

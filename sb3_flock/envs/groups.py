@@ -14,13 +14,13 @@ from typing import Any
 from pettingzoo import ParallelEnv
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.type_aliases import MaybeCallback
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env import unwrap_vec_wrapper
 from supersuit.vector.concat_vec_env import ConcatVecEnv
 
 from sb3_flock._compat import last_observations
 from sb3_flock.envs.flat_env import FlatEnv
 from sb3_flock.envs.vec_env import ParameterSharingVecEnv
-from sb3_flock.envs.wrappers import check_parallel_env, without_black_death
+from sb3_flock.envs.wrappers import check_is_parallel, check_parallel_env, without_black_death
 from sb3_flock.settings import RunError, SettingsError, check_integer
 
 
@@ -57,8 +57,7 @@ def flatten_groups(
         that differ in a space
     """
     check_integer("n_copies", n_copies, least=1)
-    if not isinstance(env, ParallelEnv) or not getattr(env, "possible_agents", None):
-        check_parallel_env(env)  # says what is wrong
+    check_is_parallel(env)
     members = {name: list(agents) for name, agents in (groups or _by_name(env.possible_agents)).items()}
     if sorted(agent for agents in members.values() for agent in agents) != sorted(env.possible_agents):
         raise SettingsError(f"groups = {members}: each of {', '.join(env.possible_agents)} is needed once")
@@ -133,10 +132,8 @@ def _by_name(agents: Sequence[str]) -> dict[str, list[str]]:
 
 
 def _group_env(name: str, model: BaseAlgorithm) -> GroupVecEnv:
-    env: VecEnv | None = model.get_env()
-    while isinstance(env, VecEnvWrapper) and not isinstance(env, GroupVecEnv):
-        env = env.venv
-    if not isinstance(env, GroupVecEnv) or env.group != name:
+    env = unwrap_vec_wrapper(model.get_env(), GroupVecEnv)  # type: ignore[arg-type]
+    if env is None or env.group != name:
         raise SettingsError(f"models: the env of the model of {name} is not that of its group, made by flatten_groups")
     return env
 

@@ -34,15 +34,23 @@ def owner_of(env: ParallelEnv, name: str) -> Any:
     return None
 
 
-def check_parallel_env(env: Any) -> None:
-    """Check that an env can be flattened.
+def check_is_parallel(env: Any) -> None:
+    """Check that something is a PettingZoo parallel env with agents.
 
-    :raises SettingsError: if it is no PettingZoo parallel env, or its agents differ in a space
+    :raises SettingsError: if it is not
     """
     if not isinstance(env, ParallelEnv):
         raise SettingsError(f"env = {format_value(env)}: a PettingZoo parallel env is needed{_hint(env)}")
     if not getattr(env, "possible_agents", None):
         raise SettingsError("env has no possible_agents: each of them gets a slot of the vector env")
+
+
+def check_parallel_env(env: Any) -> None:
+    """Check that an env can be flattened.
+
+    :raises SettingsError: if it is no PettingZoo parallel env, or its agents differ in a space
+    """
+    check_is_parallel(env)
     for kind in ("observation_space", "action_space"):
         first, *others = env.possible_agents
         space = getattr(env, kind)(first)

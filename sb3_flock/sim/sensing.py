@@ -354,6 +354,13 @@ def _norm(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.sqrt(np.square(vectors[..., 0]) + np.square(vectors[..., 1]))
 
 
+def rotate(vectors: NDArray[np.float64], angles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Vectors ``(..., 2)`` turned by angles ``(...)`` [rad]."""
+    cos, sin = np.cos(angles), np.sin(angles)
+    x, y = vectors[..., 0], vectors[..., 1]
+    return np.stack((cos * x - sin * y, sin * x + cos * y), axis=-1)
+
+
 def to_body(offsets: NDArray[np.float64], frames: NDArray[np.float64]) -> NDArray[np.float64]:
     """Rotate world offsets into the body frame: x_ij = R(theta_i) (x_j - x_i), R the rotation into the frame."""
     (x, y), (cos, sin) = np.moveaxis(offsets, -1, 0), np.moveaxis(frames, -1, 0)

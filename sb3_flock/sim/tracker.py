@@ -17,7 +17,7 @@ import numpy as np
 from pydantic import Field
 
 from sb3_flock.settings import NotNegative, Positive, Settings
-from sb3_flock.sim.sensing import Contacts, Sensing, to_body
+from sb3_flock.sim.sensing import Contacts, Sensing, rotate, to_body
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -298,7 +298,7 @@ class Tracker:
         headings = messages.frames.reshape(-1, 2)
         motion = messages.ego_motion.reshape(len(headings), -1)
         before = np.zeros((len(headings), 4))
-        before[:, 2:] = _turned(headings, -motion[:, 1])
+        before[:, 2:] = rotate(headings, -motion[:, 1])
         way = _moved(before, motion)[:, :2]
         self._ways.append(self._ways[-1] + way if self._ways else np.zeros_like(way))
         (cos, sin), (own_cos, own_sin) = headings.T, self._poses[-1][:, 2:].T
@@ -450,17 +450,11 @@ def _at(history: Sequence[NDArray[np.float64]], ages: NDArray[np.int64]) -> NDAr
     return np.stack(list(history))[last - ages, np.arange(len(ages))]
 
 
-def _turned(directions: NDArray[np.float64], angles: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Unit vectors ``(..., 2)`` turned to the left by angles ``(...)`` [rad]."""
-    cos, sin, x, y = np.cos(angles), np.sin(angles), directions[..., 0], directions[..., 1]
-    return np.stack((cos * x - sin * y, sin * x + cos * y), axis=-1)
-
-
 def _moved(poses: NDArray[np.float64], motion: NDArray[np.float64]) -> NDArray[np.float64]:
     """Poses ``(vehicles, 4)``, position [m] and the heading's cosine and sine, after an ego-motion ``(vehicles, 2 or 3)``."""
     left = motion[:, 2] if motion.shape[1] > 2 else np.zeros(len(motion))
     places = _to_odometry(np.stack((motion[:, 0], left), axis=-1), poses)
-    return np.concatenate((places, _turned(poses[:, 2:], motion[:, 1])), axis=-1)
+    return np.concatenate((places, rotate(poses[:, 2:], motion[:, 1])), axis=-1)
 
 
 def _to_odometry(positions: NDArray[np.float64], poses: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -471,6 +465,4 @@ def _to_odometry(positions: NDArray[np.float64], poses: NDArray[np.float64]) -> 
 
 def _to_body(positions: NDArray[np.float64], poses: NDArray[np.float64]) -> NDArray[np.float64]:
     """The inverse of :func:`_to_odometry`."""
-    (x, y), (at_x, at_y, cos, sin) = positions.T, poses.T
-    x, y = x - at_x, y - at_y
-    return np.stack((cos * x + sin * y, cos * y - sin * x), axis=-1)
+    return to_body(positions - poses[:, :2], poses[:, 2:])
