@@ -15,6 +15,7 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from sb3_flock.settings import NotNegative
+from sb3_flock.sim.actuators import Actuators
 from sb3_flock.sim.backend import compiled
 from sb3_flock.sim.sensing import Contacts, Sensing, SensingSettings
 from sb3_flock.sim.sensors import SensorSettings
@@ -82,6 +83,11 @@ class SafetySettings(SensingSettings, SensorSettings):
         return self.safety_filter != "off" or self.obstacle_filter
 
     @property
+    def is_reserving(self) -> bool:
+        """Whether a filter keeps the way free that the vehicles need in order to stop, for which it needs their actual speeds."""
+        return self.is_filtered and self.dynamics == "unicycle" and self.actuators != Actuators()
+
+    @property
     def guarantee_limits(self) -> tuple[str, ...]:
         """Which parameters end the guarantee of the filter that is on, as ``name = value``; empty if it holds.
 
@@ -132,9 +138,9 @@ def filter_actions(
 ) -> NDArray[np.float64]:
     """The actions with their speeds bounded; each vehicle uses what it senses, and with ``announce`` what neighbors announce.
 
-    Of a body whose position is estimated it keeps ``tracker.margin_stds`` standard deviations more. A neighbor that it knows by
-    messages alone came into range in the last step: it is at least ``link_range`` less a step's approach away, straight ahead at
-    the worst.
+    Of a neighbor whose position is estimated it keeps ``tracker.margin_stds`` standard deviations more; for obstacles the tracker
+    does that. A neighbor that it knows by messages alone came into range in the last step: it is at least ``link_range`` less a
+    step's approach away, straight ahead at the worst.
 
     Vehicles that cannot stop at once keep the way free that they need in order to stop, straight on. That lowers the number of
     violations; the guarantee is for vehicles that stop at once.
@@ -152,7 +158,8 @@ def filter_actions(
     neighbors, obstacles = sensing.neighbors, sensing.obstacles
     if settings.safety_filter != "off":
         free = neighbors.distances - settings.neighbor_separation - margin
-        gaps = np.maximum(free - _uncertainty(neighbors, settings), 0.0)
+        uncertainty = 0.0 if neighbors.stds is None else settings.tracker.margin_stds * neighbors.stds
+        gaps = np.maximum(free - uncertainty, 0.0)
         receding = _receding(sensing, settings, frames)
         observers, strides = neighbors.observers, _cosines(neighbors) * dt
         budgets = np.where(receding >= 0, gaps, gaps / 2)
@@ -160,7 +167,7 @@ def filter_actions(
         kept = settings.obstacle_separation + margin + settings.obstacle_max_speed * dt
         observers = np.concatenate((observers, obstacles.observers))
         strides = np.concatenate((strides, _cosines(obstacles) * dt))
-        gaps_to_obstacles = obstacles.distances - kept - _uncertainty(obstacles, settings)
+        gaps_to_obstacles = obstacles.distances - kept
         budgets = np.concatenate((budgets, np.maximum(gaps_to_obstacles, 0.0)))
     if sensing.unplaced is not None and settings.safety_filter != "off":
         rows, step = np.flatnonzero(sensing.unplaced), 2 * settings.max_speed * dt
@@ -244,11 +251,6 @@ def limit_speeds(
     over = np.flatnonzero(strides * limited[observers] > budgets - rounding)
     limited[observers[over]] = floors[observers[over]]
     return limited
-
-
-def _uncertainty(contacts: Contacts, settings: SafetySettings) -> NDArray[np.float64] | float:
-    """What is kept for the uncertainty of estimated positions, ``(contacts,)`` [m]; 0 for measured ones."""
-    return 0.0 if contacts.stds is None else settings.tracker.margin_stds * contacts.stds
 
 
 def _cosines(contacts: Contacts) -> NDArray[np.float64]:

@@ -75,8 +75,8 @@ class TrackerSettings(Settings):
     )
     margin_stds: NotNegative = Field(
         2.0,
-        description="what the safety filter keeps beyond safety_margin, for the uncertainty of an estimated position [standard "
-        "deviations] (paper: none)",
+        description="margin for the uncertainty of an estimated position: the safety filter keeps that of a neighbor beyond "
+        "safety_margin, and an obstacle is taken to be that much nearer [standard deviations] (paper: none)",
     )
 
 
@@ -193,6 +193,9 @@ def associate(
 
 class Tracker:
     """The tracks of every vehicle of every flock, and what they give: the bodies where they are now.
+
+    An obstacle is given nearer to the vehicle than estimated by ``margin_stds`` standard deviations, so that policies, which keep
+    to the distances that they see, keep that margin.
 
     Detections and waypoint are those of the sensors' delay ago; odometry and messages have no delay. A detection that no track
     takes starts a track. A track that takes none survives ``max_missed`` steps, or none where the sensors miss nothing that is in
@@ -360,13 +363,16 @@ class Tracker:
         ages: NDArray[np.int64],
         messages: Messages | None,
     ) -> Sensing:
-        """The tracked bodies where they are now, as far as they are in range."""
+        """The tracked bodies where they are now, as far as they are in range; obstacles nearer by their margin."""
         shape, size = self._shape, len(ages)
         tracks = self._predicted(self.tracks, frames, ages, np.zeros_like(ages))
         kinds, observers = np.divmod(tracks.labels[:, 0], size)
-        positions = _to_body(tracks.means[:, :2], self._poses[-1][observers])
+        positions, stds = _to_body(tracks.means[:, :2], self._poses[-1][observers]), np.sqrt(tracks.covariances[:, 0])
         distances = np.sqrt(np.square(positions[:, 0]) + np.square(positions[:, 1]))
-        near, stds = distances < self._ranges[kinds], np.sqrt(tracks.covariances[:, 0])
+        near = distances < self._ranges[kinds]
+        margins = np.where(kinds == 1, np.minimum(self.settings.margin_stds * stds, distances), 0.0)
+        positions *= (1 - margins / np.maximum(distances, _TINY))[:, None]
+        distances = distances - margins
         columns = observers, tracks.labels[:, 1], positions, distances, stds
         neighbors, obstacles = (
             Contacts(shape, *(column[near & (kinds == kind)] for column in columns)) for kind in range(2)

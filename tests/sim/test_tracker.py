@@ -26,7 +26,7 @@ CROWD = Scenario(n_vehicles=6, n_obstacles=3, arena=0.3, obstacle_arena=0.4, mot
 
 def tracker_of(sensors=None, **settings):
     """A tracker of one vehicle, or of several in flocks of one."""
-    scenario = Scenario(n_vehicles=1, sensors=sensors or {}, tracker={"enabled": True, **settings})
+    scenario = Scenario(n_vehicles=1, sensors=sensors or {}, tracker={"enabled": True, "margin_stds": 0.0, **settings})
     return Tracker(scenario.tracker, scenario, scenario, FlockValues(scenario.sensors))
 
 
@@ -324,13 +324,29 @@ def test_the_filter_keeps_standard_deviations_of_the_estimate():
     assert filtered_speed(np.array([0.02, 0.0])) == 0.0
 
 
-def test_the_obstacle_filter_keeps_standard_deviations_of_the_estimate():
-    scenario = Scenario(n_vehicles=1, obstacle_filter=True, obstacle_max_speed=0.0, tracker={"enabled": True})
-    world = place(scenario, [(0, 0)], [0], [(0.16, 0)])
-    sensing = world.sense()
-    for std, speed in ((0.0, 0.1), (0.002, 0.06)):
-        sensing = replace(sensing, obstacles=replace(sensing.obstacles, stds=np.array([std])))
-        assert filter_actions(np.array([[[0.15, 0.0]]]), sensing, scenario)[0, 0, 0] == pytest.approx(speed, abs=1e-6)
+@pytest.mark.parametrize("distance", [0.2, 0.01])
+def test_obstacles_are_given_nearer_by_standard_deviations_of_the_estimate(distance):
+    tracker = tracker_of({"position_noise": 0.01}, margin_stds=2.0)
+    found = tracker.update(sensed(neighbors=[(0.12, 0)], obstacles=[(0, distance)]), still())
+    np.testing.assert_allclose(found.obstacles.positions, [(0, max(distance - 0.02, 0))], atol=1e-12)
+    np.testing.assert_allclose(found.obstacles.distances, [max(distance - 0.02, 0)], atol=1e-12)
+    assert found.obstacles.stds == pytest.approx(0.01)
+    np.testing.assert_allclose(found.neighbors.positions, [(0.12, 0)], atol=1e-12)  # the filter keeps that of neighbors
+    np.testing.assert_allclose(found.waypoint_positions, [[(1.0, 0.0)]], atol=1e-12)
+
+
+def test_the_obstacle_filter_keeps_the_margin_once():
+    """Between the obstacle and 0.15 m are 0.03 m, less a margin of 0.02 m: the vehicle goes 0.01 m in a step, at 0.1 m/s."""
+    scenario = Scenario(
+        n_vehicles=1,
+        obstacle_filter=True,
+        obstacle_max_speed=0.0,
+        tracker={"enabled": True},
+        sensors={"position_noise": 0.01},
+    )
+    tracker = Tracker(scenario.tracker, scenario, scenario, FlockValues(scenario.sensors))
+    estimate = tracker.update(sensed(obstacles=[(0.18, 0)]), still())
+    assert filter_actions(np.array([[[0.15, 0.0]]]), estimate, scenario)[0, 0, 0] == pytest.approx(0.1, abs=1e-6)
 
 
 def test_a_neighbor_that_is_heard_but_not_placed_is_kept_clear_of():
