@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sb3_flock.deploy.onnx_safety import filter_shapes
 from sb3_flock.settings import RunError
 
 if TYPE_CHECKING:
@@ -77,6 +78,11 @@ class CLibrary:
             fields += [("previous", measurement), ("ego_motion", "f4", 3)]
         if scenario.safety_filter in {"heading", "announce"}:
             fields += [("neighbor_headings", "f4", n_neighbors)]
+        further = filter_shapes(scenario)
+        if "neighbor_stds" in further:
+            fields += [("neighbor_stds", "f4", n_neighbors)]
+        if "own_speed" in further:
+            fields += [("own_speed", "f4")]
         outputs = ["speed", "turn_rate"]
         if scenario.is_filtered:
             outputs += ["asked_speed", "asked_turn_rate"]
@@ -104,8 +110,11 @@ class CLibrary:
                     _fill(struct[0][measurement], name, inputs[prefix + name])
         if "ego_motion" in inputs:
             struct["ego_motion"] = inputs["ego_motion"]
-        if "neighbor_headings" in inputs:
-            struct["neighbor_headings"][0, : len(inputs["neighbor_headings"])] = inputs["neighbor_headings"]
+        for name in ("neighbor_headings", "neighbor_stds"):
+            if name in inputs:
+                struct[name][0, : len(inputs[name])] = inputs[name]
+        if "own_speed" in inputs:
+            struct["own_speed"] = inputs["own_speed"]
         return struct
 
     def latency(self, samples: Iterable[SampleInput]) -> float:

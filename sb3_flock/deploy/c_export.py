@@ -16,6 +16,7 @@ from torch import nn
 from sb3_flock.deploy.c_check import compiler, library_of
 from sb3_flock.deploy.onnx_check import compare, random_sample_inputs
 from sb3_flock.deploy.onnx_export import ExportResult, actor_of, metadata_of
+from sb3_flock.deploy.onnx_safety import filter_shapes
 from sb3_flock.rl.policies import InvertingBound
 from sb3_flock.rl.torch_layers import FlockCNN
 from sb3_flock.serialization.save import atomic_write
@@ -111,6 +112,7 @@ def source_of(policy: LoadedPolicy, scenario: Scenario) -> str:
         *([level] if level in {"motion", "announce"} else []),
         "headings" if level in {"heading", "announce"} else "infers_motion" if infers else "no_receding",
     }
+    conditions |= _further_conditions(scenario)
     if level == "off":
         conditions -= {"headings", "infers_motion", "no_receding"}
     shared = "that the vehicle or one of its neighbors detects" if scenario.shared_detections else "that the vehicle detects"
@@ -128,6 +130,16 @@ def source_of(policy: LoadedPolicy, scenario: Scenario) -> str:
         speed=speed,
         turn_rate=turn_rate,
     )
+
+
+def _further_conditions(scenario: Scenario) -> set[str]:
+    """What the filter needs for estimates, and for vehicles that do not stop at once."""
+    further = filter_shapes(scenario)
+    conditions = {"estimates" if "neighbor_stds" in further else "measured"}
+    if "own_speed" not in further:
+        return conditions | {"plain"}
+    conditions |= {"reserves", "lags" if scenario.actuators.max_acceleration is None else "brakes"}
+    return conditions | ({"announces_less"} if scenario.safety_filter == "announce" else set())
 
 
 def _select(template: str, conditions: set[str]) -> str:
@@ -182,7 +194,15 @@ def _constants(scenario: Scenario) -> Iterator[str]:
         numbers += [
             ("RESERVE", _float(_reserve(scenario), up=True), "of every budget, for errors of float32: 2^-20 ranges [m]"),
             ("DOWN", _float(1 - 2**-22), "rounds speeds down"),
+            ("BOUNDS_PER_BODY", "1" if scenario.actuators.max_acceleration is None else "2", ""),
         ]
+    further = filter_shapes(scenario)
+    if "neighbor_stds" in further:
+        numbers += [("MARGIN_STDS", _float(scenario.tracker.margin_stds, up=True), "margin for uncertainty")]
+    if "own_speed" in further:
+        numbers += [("SPEED_LAG", _float(scenario.actuators.speed_lag, up=True), "[s]")]
+        if scenario.actuators.max_acceleration is not None:
+            numbers += [("MAX_ACCELERATION", _float(scenario.actuators.max_acceleration, up=False), "[m/s^2]")]
     if scenario.safety_filter != "off":
         numbers += [
             ("NEIGHBOR_KEPT", _float(scenario.neighbor_separation + margin, up=True), "separation and margin [m]"),

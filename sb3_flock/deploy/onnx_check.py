@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sb3_flock.deploy.onnx_safety import filter_shapes
 from sb3_flock.sim import Scenario, Sensing, World, episode_rng, observe
 from sb3_flock.sim.safety import filter_actions
 from sb3_flock.sim.sensing import find_contacts
 from sb3_flock.sim.sensors import SensorErrors
 from sb3_flock.sim.tracker import TrackerSettings
+from sb3_flock.sim.unicycle import Unicycle
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -20,6 +22,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sb3_flock.serialization.load import LoadedPolicy
+    from sb3_flock.sim.dynamics import Stopping
 
 SampleInput = dict[str, "NDArray[np.float64]"]
 """The inputs of the graph by name."""
@@ -34,6 +37,8 @@ class _Sample:
     frames: NDArray[np.float64]
     asked: NDArray[np.float64]
     """What the vehicles ask for, ``(1, vehicles, 2)``."""
+    stopping: Stopping | None
+    """What they need in order to stop."""
 
 
 def compare(
@@ -106,25 +111,35 @@ def _random_samples(scenario: Scenario, count: int, seed: int) -> Iterator[_Samp
         asked = rng.uniform(world.action_low, world.action_high, (1, n_vehicles, 2))
         if scenario.safety_filter in {"heading", "announce"}:
             inputs["neighbor_headings"] = world.headings[0, 1:] - world.headings[0, 0]
+        needed, stopping = filter_shapes(scenario), None
+        if "neighbor_stds" in needed:
+            inputs["neighbor_stds"] = rng.uniform(0, 0.05 * scenario.link_range, n_vehicles - 1)
+            found = sensing.neighbors
+            stds = np.append(0.0, inputs["neighbor_stds"])[np.maximum(found.bodies, found.observers)]  # of the first vehicle
+            sensing = replace(sensing, neighbors=replace(found, stds=stds))
+        if "own_speed" in needed and isinstance(world.dynamics, Unicycle):
+            world.dynamics.rates[..., 0] = rng.uniform(0, scenario.max_speed, (1, n_vehicles))
+            stopping = world.dynamics.stopping()
+            inputs["own_speed"] = np.array(world.dynamics.rates[0, 0, 0])
+        sample = _Sample(inputs, sensing, world.frames, asked, stopping)
         if scenario.safety_filter == "announce":
-            inputs["neighbor_announced_speeds"] = _announced(asked, sensing, scenario, world.frames)[1:]
-        yield _Sample(inputs, sensing, world.frames, asked)
+            inputs["neighbor_announced_speeds"] = _announced(sample, asked, scenario)[1:]
+        yield sample
 
 
 def _executed(sample: _Sample, action: NDArray[np.float32], scenario: Scenario) -> NDArray[np.float64]:
     """What the first vehicle executes if it asks for an action, as in ``World.step``, and which speed it announces, ``(3,)``."""
     asked, low, high = sample.asked.copy(), (0.0, -scenario.max_turn_rate), (scenario.max_speed, scenario.max_turn_rate)
     asked[0, 0] = np.clip(action, low, high)
-    measured = sample.sensing, scenario, sample.frames
-    return np.append(filter_actions(asked, *measured)[0, 0], _announced(asked, *measured)[0])
+    executed = filter_actions(asked, sample.sensing, scenario, sample.frames, stopping=sample.stopping)
+    return np.append(executed[0, 0], _announced(sample, asked, scenario)[0])
 
 
-def _announced(
-    asked: NDArray[np.float64], sensing: Sensing, scenario: Scenario, frames: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """The speeds that the vehicles announce, ``(vehicles,)``: those that ``heading`` admits."""
+def _announced(sample: _Sample, asked: NDArray[np.float64], scenario: Scenario) -> NDArray[np.float64]:
+    """The speeds that the vehicles announce, ``(vehicles,)``: those that ``heading`` admits, and that they have."""
     admitted = scenario if scenario.safety_filter == "off" else scenario.replace(safety_filter="heading")
-    return filter_actions(asked, sensing, admitted, frames)[0, :, 0]
+    speeds = filter_actions(asked, sample.sensing, admitted, sample.frames, stopping=sample.stopping)[0, :, 0]
+    return speeds if sample.stopping is None else np.minimum(speeds, sample.stopping.speeds[0])
 
 
 def _measured_by_first_vehicle(world: World, sensing: Sensing) -> SampleInput:

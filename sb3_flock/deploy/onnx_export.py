@@ -167,6 +167,9 @@ class FilteredOnnxPolicy(OnnxPolicy):
     With ``heading`` and ``announce`` the graph also takes ``neighbor_headings`` ``(any number,)``, in the order of ``neighbors``:
     relative to the vehicle's own heading, to the left positive [rad], NaN if not known.
 
+    With a tracker, whose estimates the positions then are, it also takes ``neighbor_stds`` ``(any number,)``: their standard
+    deviations [m]. With actuators it takes ``own_speed`` ``()``, the vehicle's present speed [m/s].
+
     With ``announce`` a step has two runs. The first one, with zeros as ``neighbor_announced_speeds`` ``(any number,)``, gives the
     output ``announced_speed`` ``()`` [m/s], which the vehicle sends to its neighbors. The second one, with the speeds received
     from them, 0 or NaN where none was, gives ``action``.
@@ -191,6 +194,8 @@ class FilteredOnnxPolicy(OnnxPolicy):
         ego_motion: th.Tensor | None = None,
         neighbor_headings: th.Tensor | None = None,
         neighbor_announced_speeds: th.Tensor | None = None,
+        neighbor_stds: th.Tensor | None = None,
+        own_speed: th.Tensor | None = None,
     ) -> th.Tensor | tuple[th.Tensor, th.Tensor]:
         """The executed action, ``(2,)``; with ``announce`` also the speed to announce, ``()``."""
         asked = super().forward(
@@ -200,7 +205,8 @@ class FilteredOnnxPolicy(OnnxPolicy):
         if self.scenario.safety_filter == "motion" and ego_motion is not None:
             was_sensed = norm(previous_neighbors) < exact(self.scenario.link_range)
             motions = was_sensed[:, None] * (neighbors - _to_present(ego_motion)(previous_neighbors))
-        return self.filter(asked, neighbors, motions, neighbor_headings, neighbor_announced_speeds, obstacles)
+        known = motions, neighbor_headings, neighbor_announced_speeds, neighbor_stds, own_speed
+        return self.filter(asked, neighbors, *known, obstacles)
 
 
 def export(
@@ -282,7 +288,7 @@ def inputs_of(scenario: Scenario) -> dict[str, Shape]:
     if scenario.motion_lag:
         before = "neighbors" if scenario.safety_filter == "motion" else "previous_neighbors"
         shapes |= zip(PREVIOUS_INPUTS, ((before, 2), ("previous_obstacles", 2), (2,), (3,)), strict=True)
-    names = ("neighbor_headings", "neighbor_announced_speeds")
+    names = ("neighbor_headings", "neighbor_announced_speeds", "neighbor_stds", "own_speed")
     return shapes | {name: shape for name, shape in filter_shapes(scenario).items() if name in names}
 
 
@@ -304,10 +310,16 @@ _INPUTS_OF_LEVELS = {
 
 
 _ESTIMATES = (
-    "positions are those that a tracker in front of this file estimates for now, as sb3_flock.sim.tracker does; the filter in "
-    "this file keeps nothing for their uncertainty beyond safety_margin"
+    "positions are those that a tracker in front of this file estimates for now, as sb3_flock.sim.tracker does, obstacles nearer "
+    "by margin_stds standard deviations"
 )
 """What the metadata says where the scenario has a tracker."""
+
+_INPUTS_OF_FILTERS = {
+    "neighbor_stds": "; neighbor_stds (any,): standard deviation of each coordinate of their estimates [m], NaN: not approached",
+    "own_speed": "; own_speed (): of the vehicle now [m/s], NaN: its top speed",
+}
+"""What the metadata says about further inputs of the filter."""
 
 
 def _metadata(policy: LoadedPolicy, scenario: Scenario) -> dict[str, Any]:
@@ -320,6 +332,7 @@ def _metadata(policy: LoadedPolicy, scenario: Scenario) -> dict[str, Any]:
     outputs = "action (2,): speed [m/s], turn rate [rad/s]"
     if scenario.is_filtered:
         inputs += _INPUTS_OF_LEVELS.get(scenario.safety_filter, "")
+        inputs += "".join(text for name, text in _INPUTS_OF_FILTERS.items() if name in filter_shapes(scenario))
     if scenario.safety_filter == "announce":
         outputs += "; announced_speed (): to send to the neighbors [m/s]"
     return {**metadata_of(policy, scenario), "inputs": inputs, "output": outputs, "exported_with": versions()}
@@ -331,8 +344,12 @@ def metadata_of(policy: LoadedPolicy, scenario: Scenario) -> dict[str, Any]:
     names += ["time_step", "max_speed", "max_turn_rate", "motion_lag"]
     if scenario.is_filtered:
         names += ["safety_filter", "obstacle_filter", "safety_margin", "obstacle_max_speed"]
-    tracker = {"estimates": _ESTIMATES} if scenario.tracker.enabled else {}
-    return {**policy.describe(), "policy": policy.path.name, **{name: getattr(scenario, name) for name in names}, **tracker}
+    more: dict[str, Any] = {}
+    if scenario.tracker.enabled:
+        more |= {"estimates": _ESTIMATES, "margin_stds": scenario.tracker.margin_stds}
+    if scenario.is_reserving:
+        more |= {name: getattr(scenario.actuators, name) for name in ("speed_lag", "max_acceleration")}
+    return {**policy.describe(), "policy": policy.path.name, **{name: getattr(scenario, name) for name in names}, **more}
 
 
 @contextlib.contextmanager

@@ -31,6 +31,8 @@ _SHAPES: dict[str, Shape] = {
     "neighbor_motions": ("neighbors", 2),
     "neighbor_headings": ("neighbors",),
     "neighbor_announced_speeds": ("neighbors",),
+    "neighbor_stds": ("neighbors",),
+    "own_speed": (),
     "obstacles": ("obstacles", 2),
 }
 
@@ -53,6 +55,9 @@ class OnnxSafetyFilter(nn.Module):
       [m]; 0 or NaN if not known
     - ``neighbor_headings`` ``(any,)``: relative to the vehicle's own heading, to the left positive [rad]; NaN if not known
     - ``neighbor_announced_speeds`` ``(any,)``: [m/s]; 0 or NaN if not received
+    - with a tracker ``neighbor_stds`` ``(any,)``: standard deviation of each coordinate of an estimated position [m]; the vehicle
+      does not approach a neighbor with NaN
+    - with actuators ``own_speed`` ``()``: the vehicle's present speed [m/s]; NaN counts as the top speed
 
     It returns the action ``(2,)``. With ``announce`` it also returns the speed ``()`` [m/s] that the vehicle has to announce,
     which does not depend on ``neighbor_announced_speeds``. A heading or an announcement that is missing lowers the speed as the
@@ -72,6 +77,8 @@ class OnnxSafetyFilter(nn.Module):
         neighbor_motions: th.Tensor | None = None,
         neighbor_headings: th.Tensor | None = None,
         neighbor_announced_speeds: th.Tensor | None = None,
+        neighbor_stds: th.Tensor | None = None,
+        own_speed: th.Tensor | None = None,
         obstacles: th.Tensor | None = None,
     ) -> th.Tensor | tuple[th.Tensor, th.Tensor]:
         """The filtered action; with ``announce`` also the announced speed."""
@@ -84,7 +91,13 @@ class OnnxSafetyFilter(nn.Module):
             assert neighbors is not None
             neighbors = neighbors * _UNIT
             distances, cosines = _distances_and_cosines(neighbors)
-            gaps = (distances - _length(settings.neighbor_separation) - margin).clamp(min=0)
+            free = distances - _length(settings.neighbor_separation) - margin
+            if neighbor_stds is not None:
+                uncertain = th.where(neighbor_stds >= 0, neighbor_stds, exact(np.inf)) * _length(
+                    settings.tracker.margin_stds
+                )
+                free = free - uncertain
+            gaps = free.clamp(min=0)
             receding = self._receding(neighbors, distances, neighbor_motions, neighbor_headings)
             sensed.append(distances < _length(settings.link_range))
             strides.append(cosines * dt)
@@ -107,11 +120,34 @@ class OnnxSafetyFilter(nn.Module):
             ROUNDING * (settings.safety_margin + max(settings.neighbor_separation, settings.obstacle_separation))
         )
         contacts = th.cat(sensed, -1), th.cat(strides, -1)
-        speed = _limit_speed(asked, th.zeros_like(asked), *contacts, th.cat(budgets, -1), rounding)
+        if own_speed is not None:
+            own_speed = th.where(own_speed >= 0, own_speed, max_speed)
+
+        def limit(floor: th.Tensor, within: list[th.Tensor]) -> th.Tensor:
+            bounds = *contacts, th.cat(within, -1)
+            if own_speed is not None:
+                bounds = self._reserve_stopping(*bounds, own_speed)
+            return _limit_speed(asked, floor, *bounds, rounding)
+
+        speed = limit(th.zeros_like(asked), budgets)
         if settings.safety_filter != "announce":
             return th.stack((speed, turn_rate), dim=-1)
-        final = _limit_speed(asked, speed, *contacts, th.cat(raised, -1), rounding)
-        return th.stack((final, turn_rate), dim=-1), speed
+        announced = speed if own_speed is None else speed.minimum(own_speed)
+        return th.stack((limit(speed, raised), turn_rate), dim=-1), announced
+
+    def _reserve_stopping(
+        self, sensed: th.Tensor, strides: th.Tensor, budgets: th.Tensor, own_speed: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+        """:func:`~sb3_flock.sim.safety.reserve_stopping` for bodies in rows of a vehicle's own."""
+        settings, actuators = self.settings, self.settings.actuators
+        ahead = strides.clamp(min=0) / exact(settings.time_step) * own_speed[..., None]  # m/s times _UNIT
+        budgets = budgets - ahead * exact(actuators.speed_lag)
+        if actuators.max_acceleration is None:
+            return sensed, strides, budgets.clamp(min=0)
+        bound = exact(actuators.max_acceleration)
+        braking, steeper = ahead * own_speed[..., None] / (2 * bound), strides + ahead / bound
+        both = th.cat((budgets - braking, budgets + braking), -1).clamp(min=0)
+        return th.cat((sensed, sensed), -1), th.cat((strides, steeper), -1), both
 
     def _receding(
         self,
@@ -138,7 +174,13 @@ class OnnxSafetyFilter(nn.Module):
 
 def filter_shapes(settings: SafetySettings) -> dict[str, Shape]:
     """Names and shapes of the inputs that :class:`OnnxSafetyFilter` needs."""
-    names = ("asked_action", *_KNOWN[settings.safety_filter], *(["obstacles"] if settings.obstacle_filter else []))
+    names = ["asked_action", *_KNOWN[settings.safety_filter]]
+    if settings.tracker.enabled and settings.safety_filter != "off":
+        names += ["neighbor_stds"]
+    if settings.is_reserving:
+        names += ["own_speed"]
+    if settings.obstacle_filter:
+        names += ["obstacles"]
     return {name: _SHAPES[name] for name in names}
 
 

@@ -47,6 +47,12 @@ typedef struct {
 //: if headings
     float neighbor_headings[FLOCK_MAX_NEIGHBORS]; /* relative to the own one, left positive, -2 pi to 2 pi [rad]; NaN: unknown */
 //: end
+//: if estimates
+    float neighbor_stds[FLOCK_MAX_NEIGHBORS]; /* standard deviation of each coordinate of their estimates [m]; NaN: not approached */
+//: end
+//: if reserves
+    float own_speed; /* of the vehicle now [m/s] */
+//: end
 } FlockInput;
 
 typedef struct {
@@ -130,6 +136,11 @@ static int flock_is_readable(const FlockInput *input)
 //: if lag
     if (!flock_is_measurement(&input->previous) || !flock_are_points(&input->ego_position, 1, 1) ||
         !flock_is_number(input->ego_turn)) {
+        return 0;
+    }
+//: end
+//: if reserves
+    if (!(input->own_speed >= 0.0f && input->own_speed <= FLOCK_NOT_SENSED)) {
         return 0;
     }
 //: end
@@ -351,16 +362,43 @@ $network
 /* By how much a speed of 1 m/s approaches each body in range in a step [s], and by how much the vehicle may approach it [m]. */
 typedef struct {
     int count;
-    float strides[FLOCK_MAX_NEIGHBORS + FLOCK_MAX_OBSTACLES];
-    float budgets[FLOCK_MAX_NEIGHBORS + FLOCK_MAX_OBSTACLES];
+    float strides[FLOCK_BOUNDS_PER_BODY * (FLOCK_MAX_NEIGHBORS + FLOCK_MAX_OBSTACLES)];
+    float budgets[FLOCK_BOUNDS_PER_BODY * (FLOCK_MAX_NEIGHBORS + FLOCK_MAX_OBSTACLES)];
 } FlockBounds;
 
-static void flock_add_bound(FlockBounds *bounds, FlockPoint point, float distance, float budget)
+static void flock_add_row(FlockBounds *bounds, float stride, float budget)
 {
-    bounds->strides[bounds->count] = distance > 0.0f ? point.x / distance * FLOCK_TIME_STEP : 0.0f;
-    bounds->budgets[bounds->count] = budget;
+    bounds->strides[bounds->count] = stride;
+    bounds->budgets[bounds->count] = budget > 0.0f ? budget : 0.0f;
     bounds->count++;
 }
+
+//: if plain
+static void flock_add_bound(const FlockInput *input, FlockBounds *bounds, FlockPoint point, float distance, float budget)
+{
+    (void)input;
+    flock_add_row(bounds, distance > 0.0f ? point.x / distance * FLOCK_TIME_STEP : 0.0f, budget);
+}
+
+//: end
+//: if reserves
+/* The way that the vehicle needs in order to stop is a part of what it approaches. */
+static void flock_add_bound(const FlockInput *input, FlockBounds *bounds, FlockPoint point, float distance, float budget)
+{
+    const float toward = distance > 0.0f ? point.x / distance : 0.0f, stride = toward * FLOCK_TIME_STEP;
+    const float ahead = toward > 0.0f ? toward * input->own_speed : 0.0f;
+    const float left = budget - ahead * FLOCK_SPEED_LAG;
+//: if brakes
+    const float braking = 0.5f * ahead * input->own_speed / FLOCK_MAX_ACCELERATION;
+    flock_add_row(bounds, stride, left - braking);
+    flock_add_row(bounds, stride + ahead / FLOCK_MAX_ACCELERATION, left + braking);
+//: end
+//: if lags
+    flock_add_row(bounds, stride, left);
+//: end
+}
+
+//: end
 
 //: if neighbor_filter
 /* The share of a neighbor's heading that points away from the vehicle, or less where that is not known. */
@@ -404,13 +442,20 @@ static void flock_find_bounds(const FlockInput *input, const float *announced_sp
     for (i = 0; i < now->n_neighbors; i++) {
         const float distance = flock_distance(now->neighbors[i]);
         if (distance < FLOCK_NEIGHBOR_REACH) {
-            const float gap = distance > FLOCK_NEIGHBOR_KEPT ? distance - FLOCK_NEIGHBOR_KEPT : 0.0f;
+//: if estimates
+            const float std = input->neighbor_stds[i] >= 0.0f ? input->neighbor_stds[i] : FLOCK_NOT_SENSED;
+            const float free = distance - FLOCK_NEIGHBOR_KEPT - FLOCK_MARGIN_STDS * std;
+//: end
+//: if measured
+            const float free = distance - FLOCK_NEIGHBOR_KEPT;
+//: end
+            const float gap = free > 0.0f ? free : 0.0f;
             const float receding = flock_receding(input, i, distance);
             float budget = receding >= 0.0f ? gap : 0.5f * gap;
             if (announced_speeds && announced_speeds[i] > 0.0f && flock_is_number(announced_speeds[i]) && receding > 0.0f) {
                 budget += receding * flock_clip(announced_speeds[i], 0.0f, FLOCK_MAX_SPEED) * FLOCK_TIME_STEP;
             }
-            flock_add_bound(bounds, now->neighbors[i], distance, budget);
+            flock_add_bound(input, bounds, now->neighbors[i], distance, budget);
         }
     }
 //: end
@@ -419,7 +464,7 @@ static void flock_find_bounds(const FlockInput *input, const float *announced_sp
         const float distance = flock_distance(now->obstacles[i]);
         if (distance < FLOCK_OBSTACLE_REACH) {
             const float gap = distance > FLOCK_OBSTACLE_KEPT ? distance - FLOCK_OBSTACLE_KEPT : 0.0f;
-            flock_add_bound(bounds, now->obstacles[i], distance, gap);
+            flock_add_bound(input, bounds, now->obstacles[i], distance, gap);
         }
     }
 //: end
@@ -460,6 +505,9 @@ int flock_filter(const FlockInput *input, FlockOutput *output)
 //: if announce
     output->announced_speed = output->speed;
 //: end
+//: if announces_less
+    output->announced_speed = output->speed < input->own_speed ? output->speed : input->own_speed;
+//: end
     return FLOCK_OK;
 }
 
@@ -467,9 +515,14 @@ int flock_filter(const FlockInput *input, FlockOutput *output)
 void flock_raise_speed(const FlockInput *input, const float announced_speeds[FLOCK_MAX_NEIGHBORS], FlockOutput *output)
 {
     FlockBounds bounds;
+    float floor = output->announced_speed;
     if (flock_is_readable(input)) {
+//: if announces_less
+        flock_find_bounds(input, 0, &bounds);
+        floor = flock_limit_speed(output->asked_speed, 0.0f, &bounds);
+//: end
         flock_find_bounds(input, announced_speeds, &bounds);
-        output->speed = flock_limit_speed(output->asked_speed, output->announced_speed, &bounds);
+        output->speed = flock_limit_speed(output->asked_speed, floor, &bounds);
     }
 }
 

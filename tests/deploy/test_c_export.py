@@ -28,6 +28,9 @@ from tests.sim.test_safety import DRIVERS, FILTERS, random_task
 pytestmark = pytest.mark.skipif(compiler() is None, reason="needs a C compiler (cc)")
 
 
+TRACKER = {"enabled": True, "shared_motion": True}
+
+
 @pytest.fixture
 def small(model):
     """A small untrained policy."""
@@ -53,6 +56,9 @@ def library(small):
         ("flock", {"safety_filter": "announce", "obstacle_filter": True, "safety_margin": 0.002}),
         ("flock", {}),
         ("flock", {"safety_filter": "heading"}),
+        ("flock", {"actuators": {"speed_lag": 0.1, "slip": 0.05}, "obstacle_filter": True}),
+        ("flock", {"actuators": {"speed_lag": 0.1, "max_acceleration": 0.3}, "tracker": TRACKER}),
+        ("flock", {"safety_filter": "voronoi", "tracker": TRACKER}),
     ],
 )
 def test_the_compiled_file_acts_as_policy_and_filter_do(name, changes):
@@ -315,6 +321,37 @@ def test_a_controller_that_asks_for_nan_stops(moving, field):
     output[field] = np.nan
     assert library.call("flock_filter", struct, output) == [1]
     assert output["speed"] == output["turn_rate"] == 0
+
+
+def reserving(library, **changes):
+    """One vehicle with actuators and estimates, top speed asked, behind a neighbor that stands in front of it."""
+    settings = {"actuators": {"speed_lag": 0.1, "max_acceleration": 0.3}, "tracker": TRACKER, **changes}
+    built = library(Scenario(safety_filter="announce", **settings))
+
+    def run(own_speed=0.0, std=0.0, distance=0.12, announced=0.0):
+        struct, output = np.zeros(1, built.input), np.zeros(1, built.output)
+        struct["now"]["n_neighbors"], struct["now"]["neighbors"][0, 0] = 1, (distance, 0.0)
+        struct["own_speed"], struct["neighbor_stds"][0, 0], output["asked_speed"] = own_speed, std, 0.15
+        code = built.call("flock_filter", struct, output)
+        built.call("flock_raise_speed", struct, np.full((1, *built.announced.shape), announced, np.float32), output)
+        return code[0], float(output["speed"][0]), float(output["announced_speed"][0])
+
+    return run
+
+
+def test_a_vehicle_keeps_its_way_to_stop_and_the_uncertainty_of_estimates(library):
+    """The way of u dt + v lag + v^2 / (2 a), or of u (dt + v / a) + v lag - v^2 / (2 a), fits the gap of 0.02 m."""
+    run, v = reserving(library), 0.09
+    speeds = [(0.02 - 0.1 * v - v * v / 0.6) / 0.1, (0.02 - 0.1 * v + v * v / 0.6) / (0.1 + v / 0.3)]
+    code, speed, announced = run(own_speed=v)
+    assert (code, speed) == (0, pytest.approx(max(min(speeds), 0.0), abs=1e-5))
+    assert announced == speed
+    assert run(own_speed=0.0)[1:] == (pytest.approx(0.15, abs=1e-6), 0.0)  # it has no speed yet to announce
+    assert run(own_speed=0.0, std=0.0075)[1] == pytest.approx(0.05, abs=1e-5)
+    assert run(own_speed=0.0, std=0.0075, announced=0.04)[1] == pytest.approx(0.09, abs=1e-5)
+    assert run(std=np.nan)[1] == 0.0
+    for unreadable in (np.nan, -0.1, 1e16):
+        assert run(own_speed=unreadable)[:2] == (1, 0.0)
 
 
 def test_a_vehicle_reaches_the_speed_that_it_has_announced(library):

@@ -334,6 +334,38 @@ def test_the_motion_of_a_neighbor_is_that_of_its_row(policy, before, speed):
     assert action[0].item() == pytest.approx(speed, rel=1e-5)
 
 
+def test_a_policy_with_actuators_and_a_tracker_keeps_its_way_to_stop(policy, tmp_path):
+    actuators = {"speed_lag": 0.1, "max_acceleration": 0.3}
+    scenario = policy.scenario.replace(actuators=actuators, tracker={"enabled": True}, obstacle_filter=True)
+    done = export(policy, tmp_path / "policy.onnx", 150, scenario=scenario)
+    assert done.difference < TOLERANCE
+    metadata = json.loads(onnx.load(done.path).metadata_props[0].value)
+    assert metadata["max_acceleration"] == 0.3
+    assert "own_speed ()" in metadata["inputs"]
+
+
+def test_the_graph_keeps_the_way_to_stop_and_the_uncertainty_of_estimates():
+    """The ways to stop, :func:`~sb3_flock.sim.safety.reserve_stopping`, fit the gap of 0.02 m to a neighbor that stands."""
+    actuators = {"speed_lag": 0.1, "max_acceleration": 0.3}
+    session = filter_graph(Scenario(safety_filter="announce", actuators=actuators, tracker={"enabled": True}))
+
+    def run(own_speed=0.0, std=0.0, announced=0.0):
+        values = [(0.15, 0.0), [(0.12, 0.0)], [0.0], [announced], [std], own_speed]
+        names = [part.name for part in session.get_inputs()]
+        action, announces = session.run(None, {n: np.array(v, dtype=float) for n, v in zip(names, values, strict=True)})
+        return action[0], float(announces)
+
+    v = 0.09
+    bounds = (0.02 - 0.1 * v - v * v / 0.6) / 0.1, (0.02 - 0.1 * v + v * v / 0.6) / (0.1 + v / 0.3)
+    speed = pytest.approx(min(bounds), abs=1e-7)
+    assert run(own_speed=v) == (speed, speed)
+    assert run(own_speed=np.nan) == run(own_speed=0.15)  # the worst is assumed
+    assert run(own_speed=0.0) == (0.15, 0.0)  # it has no speed yet to announce
+    assert run(std=0.0075)[0] == pytest.approx(0.05, abs=1e-7)
+    assert run(std=0.0075, announced=0.04)[0] == pytest.approx(0.09, abs=1e-7)
+    assert run(std=np.nan)[0] == 0.0
+
+
 def in_frame(position, heading, points):
     """Positions in the frame of a vehicle."""
     cos, sin = np.cos(heading), np.sin(heading)
