@@ -123,5 +123,5 @@ def test_a_shipped_policy_was_trained_by_its_config(name):
         dict(leaves(effective(each).model_dump(mode="json"))) for each in (TrainingConfig(**values), load(TRAINED_BY[name]))
     )
     differing = {field for field in trained.keys() | config.keys() if trained.get(field) != config.get(field)}
-    assert differing <= {"seed"}
+    assert differing <= {"seed", "save_freq"}  # checkpoints change no training
     assert trained["seed"] == card["shipped_seed"]

@@ -13,7 +13,7 @@ EXPERT_PRESETS: dict[str, dict[str, Any]] = {
         "scenario.reward.lambda_": 0.7,
         "scenario.reward.scale": 0.05,
         "train_env.flock_sizes": None,  # as in the task
-        "train_env.extra_obstacles": 1,
+        "train_env.expert_fraction": 0.0,
         "train_env.action_repeat": 1,
         "train_env.separation_scale": 1.02,
         "train_env.obstacle_separation_scale": 1.18,
@@ -32,7 +32,6 @@ EXPERT_PRESETS: dict[str, dict[str, Any]] = {
         "total_timesteps": 200_000,
         "n_flocks": 26,
         "eval_freq": 25_000,
-        "save_freq": 100_000,
     },
 }
 """By expert: values by the parameter's whole name. A test holds those of ``mpc`` beside ``configs/flock.yaml``, from which they

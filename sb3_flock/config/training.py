@@ -210,7 +210,7 @@ class TrainingConfig(ModelSettings, TaskConfig):
     n_test_episodes: int = Field(
         1000, ge=1, le=1_000_000, description="episodes of the final evaluation of the best model, on a separate seed"
     )
-    save_freq: Count = Field(25_000, description="transitions between checkpoints; 0: none")
+    save_freq: Count = Field(100_000, description="transitions between checkpoints; 0: none")
     keep_checkpoints: int = Field(
         2,
         ge=1,

@@ -57,7 +57,8 @@ class AlgorithmSpec:
     """The same for the policy."""
     policy_kwargs: Callable[[NetworkConfig], dict[str, Any]] = flock_policy_kwargs
     action_bounds: tuple[str, ...] = ()
-    """Accepted values of ``network.action_bound``; the first is the default, and goes to the policy as ``action_bound``."""
+    """Accepted values of ``network.action_bound``, which go to the policy as ``action_bound``; the first stands for null. Without
+    any, the policy gets none, and tanh and null are accepted."""
     has_compact_buffer: bool = True
     """Whether it samples from a :class:`~sb3_flock.rl.buffers.CompactReplayBuffer`; otherwise from SB3's own buffer."""
     has_action_noise: bool = True
@@ -114,9 +115,11 @@ class ModelSettings(Settings):
         if self.algo not in ALGORITHMS:
             raise ValueError(f"algo = {self.algo!r}: one of {_names(ALGORITHMS)} is needed{suggest(self.algo, ALGORITHMS)}")
         spec, algorithm, bound = ALGORITHMS[self.algo], self.algorithm, self.network.action_bound
-        if bound is not None and bound not in spec.action_bounds:
-            needed = f"one of {_names(spec.action_bounds)} or null" if spec.action_bounds else "null"
-            raise ValueError(f"network.action_bound = {bound!r}: input should be {needed} with algo = {self.algo}")
+        bounds = spec.action_bounds or ("tanh",)  # a stochastic actor has a tanh of its own
+        if bound is not None and bound not in bounds:
+            raise ValueError(
+                f"network.action_bound = {bound!r}: input should be one of {_names(bounds)} or null with algo = {self.algo}"
+            )
         if algorithm.mirror_augmentation and not uses_compact_buffer(self):
             raise ValueError(
                 "algorithm.mirror_augmentation = True: input should be false or null with "

@@ -92,7 +92,9 @@ def with_earlier_defaults(values):
         "obstacle_separation_scale": None,
     }
     off = {"safety_filter": "off", "shared_detections": False}
-    return {**values, "scenario": {**off, **scenario, "reward": reward}, "train_env": {**then, **train_env}}
+    network = {"action_bound": None, **values.get("network", {})}
+    groups = {"scenario": {**off, **scenario, "reward": reward}, "train_env": {**then, **train_env}, "network": network}
+    return {**values, **groups}
 
 
 # -- format numbers --------------------------------------------------------------------------------------------------
@@ -205,9 +207,9 @@ def test_options_that_an_earlier_release_ignored_are_dropped(old, ignored):
 
 
 def test_options_that_do_not_apply_are_not_dropped_from_a_present_config():
-    values = {"algo": "sac", "network": {"action_bound": "tanh"}}
+    values = {"algo": "sac", "network": {"action_bound": "inverting"}}
     current, _ = migrate_config(TrainingConfig, values, FORMAT)
-    with pytest.raises(SettingsError, match="network.action_bound = 'tanh'"):
+    with pytest.raises(SettingsError, match="network.action_bound = 'inverting'"):
         TrainingConfig(**current)
 
 
