@@ -29,6 +29,7 @@ EXPERT_PRESETS: dict[str, dict[str, Any]] = {
         "algorithm.utd_ratio": 0.06,
         "algorithm.action_noise_std": 0.1,
         "network.channels": (32,),
+        "network.action_bound": "tanh",
         "total_timesteps": 200_000,
         "n_flocks": 26,
         "eval_freq": 25_000,

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from sb3_flock.evaluation.rollout import as_controller
 from sb3_flock.settings import SettingsError
 from sb3_flock.sim import Contacts, Scenario, Sensing, observe
-from sb3_flock.sim.dynamics import directions_of, wrap_angle
-from sb3_flock.sim.randomization import FlockValues
+from sb3_flock.sim.actuators import follow
+from sb3_flock.sim.dynamics import Stopping, directions_of, wrap_angle
+from sb3_flock.sim.randomization import UNBOUNDED, FlockValues
 from sb3_flock.sim.safety import filter_actions
 from sb3_flock.sim.sensing import sense
 from sb3_flock.sim.sensors import SensorErrors, Sensors
@@ -90,7 +91,8 @@ class VehicleController:
 
     Everything is computed as the world and an evaluation compute it for this vehicle. Its sensors are exact: errors are those of
     the poses. The vehicle's ego-motion is taken from its own poses. Where the scenario has a tracker, the vehicle acts on the
-    tracker's estimates; ``sensors`` says which errors the tracker expects.
+    tracker's estimates; ``sensors`` says which errors the tracker expects. Where it has ``actuators``, the filter keeps the way
+    free that the vehicle needs in order to stop; its speed is then what the actuators make of its commands.
 
     A cycle is :meth:`reason_to_stop`, :meth:`ask`, and :meth:`act`. All times are those of one clock that never goes back [s].
 
@@ -117,9 +119,10 @@ class VehicleController:
         if scenario.tracker.enabled:
             self._tracker = Tracker(scenario.tracker, scenario, scenario, FlockValues(scenario.sensors))
         self._own_poses: deque[NDArray[np.float64]] = deque(maxlen=1 + (self._tracker.delay_steps if self._tracker else 0))
+        self._speed, self._command = scenario.actuators.min_speed, STOP
         self._bounds = (0.0, -scenario.max_turn_rate), (scenario.max_speed, scenario.max_turn_rate)
         self._before: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
-        self._cycle: tuple[NDArray[np.float64], Sensing, NDArray[np.float64]] | None = None
+        self._cycle: tuple[NDArray[np.float64], Sensing, NDArray[np.float64], Stopping | None] | None = None
 
     @property
     def own(self) -> Body:
@@ -144,6 +147,7 @@ class VehicleController:
             self.ask()
             self.act()
         self.forget()
+        self._speed, self._command = self.scenario.actuators.min_speed, STOP
         for body in self.bodies:
             body.receive(0.0, 0.0, 0.0, 0.0, stamp=-1, fault=Body.fault)
 
@@ -189,8 +193,24 @@ class VehicleController:
         if not np.isfinite(asked).all():
             raise ValueError(f"the policy's action is not finite: {asked.tolist()}")
         actions[0, self.vehicle] = np.clip(asked, *self._bounds)
-        self._cycle = (actions, sensing, frames)
-        return float(filter_actions(actions, sensing, self._announcing, frames)[0, self.vehicle, 0])
+        stopping = None
+        if self.scenario.is_reserving:
+            neighbors, obstacles = (_of(contacts, self.vehicle) for contacts in (sensing.neighbors, sensing.obstacles))
+            sensing, stopping = replace(sensing, neighbors=neighbors, obstacles=obstacles), self._stopping()
+        self._cycle = (actions, sensing, frames, stopping)
+        speed = float(filter_actions(actions, sensing, self._announcing, frames, stopping=stopping)[0, self.vehicle, 0])
+        return min(speed, self._speed) if stopping is not None and self.announces else speed
+
+    def _stopping(self) -> Stopping:
+        """What the vehicle needs in order to stop; the others announce no more than they reach."""
+        actuators, dt = self.scenario.actuators, self.scenario.time_step
+        bound = UNBOUNDED if actuators.max_acceleration is None else actuators.max_acceleration
+        lag, most = np.array(actuators.speed_lag), np.array(bound)
+        commanded = np.array(max(self._command[0], actuators.min_speed))
+        self._speed = float(follow(np.array(self._speed), commanded, lag, most, dt)[0])
+        speeds = np.full((1, len(self.vehicles)), self.scenario.max_speed)
+        speeds[0, self.vehicle] = self._speed
+        return Stopping(speeds, lag, most)
 
     def _from(self, measurement: Measurement) -> tuple[Sensing, NDArray[np.float64], Messages]:
         """What the vehicle senses, the frames of all vehicles, and what neighbors share."""
@@ -243,11 +263,12 @@ class VehicleController:
             costs speed and no separation
         """
         assert self._cycle is not None
-        actions, sensing, frames = self._cycle
+        actions, sensing, frames, stopping = self._cycle
         for number, speed in (announced or {}).items():
             if number != self.vehicle and speed > 0:
                 actions[0, number, 0] = min(speed, self.scenario.max_speed)
-        speed, turn_rate = filter_actions(actions, sensing, self.scenario, frames)[0, self.vehicle].tolist()
+        filtered = filter_actions(actions, sensing, self.scenario, frames, stopping=stopping)
+        self._command = speed, turn_rate = tuple(filtered[0, self.vehicle].tolist())
         return speed, turn_rate
 
     def forget(self) -> None:
@@ -257,6 +278,7 @@ class VehicleController:
         if self._tracker is not None:
             self._tracker.reset()
         self._before = self._cycle = None
+        self._command = (self._speed, 0.0)  # a vehicle that stops is not faster than it was
 
     def _ego_motion(self, positions: NDArray[np.float64], headings: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """The vehicles' motion since the last cycle, forward and turn; motion across the heading is left out."""

@@ -30,9 +30,9 @@ class NetworkConfig(Settings):
         3e-3, gt=0, description="bound of the output layers' uniform initialization; null: torch's own (paper: not stated)"
     )
     action_bound: Literal["inverting", "tanh"] | None = Field(
-        "tanh",
-        description="how the actor's output is bounded: tanh, or inverting (a clamp with inverting gradients), which needs a "
-        "deterministic actor; null: inverting with ddpg, ddpg-sb3 and td3 (paper: not stated)",
+        None,
+        description="how the actor's output is bounded: inverting (a clamp with inverting gradients) or tanh; "
+        "null: inverting where the algorithm has a deterministic actor, tanh elsewhere (paper: not stated)",
     )
     n_critics: int = Field(2, ge=1, le=32, description="number of critics; the smallest value counts (paper: 1)")
 
@@ -67,7 +67,7 @@ class AlgorithmConfig(Settings):
     train_freq: int = Field(
         1, ge=1, le=1_000_000, description="vector steps (one transition a vehicle) between rounds of updates (paper: 1)"
     )
-    utd_ratio: Positive = Field(0.36, description="update-to-data ratio: updates for each transition (paper: 1)")
+    utd_ratio: Positive = Field(0.4, description="update-to-data ratio: updates for each transition (paper: 1)")
     action_noise_std: NotNegative = Field(
         0.4,
         description="standard deviation of the exploration noise at the start [half the action range] (paper: not stated)",

@@ -104,7 +104,6 @@ _BEFORE_FORMAT_4: dict[str, dict[str, Any]] = {
         "shared_detections": False,
         "reward": {"link_bonus": 0.5, "lambda_": 0.7},
     },
-    "network": {"action_bound": None},
     "train_env": {
         "flock_sizes": (4,),
         "extra_obstacles": 1,

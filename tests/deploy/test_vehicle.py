@@ -232,6 +232,35 @@ def test_headings_of_quaternions():
     assert math.isnan(heading_of(0.0, 0.0, 0.0, 0.0))
 
 
+@pytest.mark.parametrize(
+    "actuators", [{"speed_lag": 0.1}, {"speed_lag": 0.1, "max_acceleration": 0.3, "min_speed": 0.02}, {"turn_lag": 0.3}]
+)
+def test_commands_with_actuators_are_those_of_the_world(actuators):
+    """The filter keeps the way to stop free, by the speed that the actuators make of the commands."""
+    policy = load_policy("flock")
+    scenario = policy.scenario.replace(actuators=actuators, arena=0.4, obstacle_filter=True)
+    assert max(differences(policy, scenario, 80)) < ROUNDING
+    reserve, world = [], World(scenario.replace(safety_filter="off", obstacle_filter=False))
+    world.reset([episode_rng(0, 0)])
+    controller = VehicleController(Straight(), scenario, 0, TIMEOUT)
+    for _ in range(5):
+        show(controller, world, 0.0)
+        controller.ask()
+        reserve.append(controller.act()[0])
+    assert reserve[-1] <= reserve[0]
+
+
+def test_after_a_stop_a_vehicle_is_as_fast_as_before_at_most():
+    controller = placed((0, 0), (0.14, 0), actuators={"speed_lag": 0.2}, safety_filter="announce")
+    speeds = []
+    for _ in range(3):
+        speeds.append(controller.ask())
+        controller.act({1: 0.15})
+    assert speeds[0] == 0.0 < speeds[1] < speeds[2]  # it announces the speed that it has
+    controller.forget()
+    assert controller.ask() == pytest.approx(speeds[2], abs=0.03)
+
+
 FIELD = {"position_noise": 0.01, "dropout": 0.1, "delay": 0.1, "odometry_noise": 0.02}
 
 

@@ -10,6 +10,7 @@ from stable_baselines3.sac.policies import SACPolicy
 from sb3_flock import CompactReplayBuffer, FlockCNN, FlockDDPG, FlockPolicy, load_policy, make_vec_env, save_model
 from sb3_flock.config.training import TrainingConfig
 from sb3_flock.rl.ddpg import FlockTD3
+from sb3_flock.rl.policies import InvertingBound
 from sb3_flock.rl.registry import (
     ALGORITHMS,
     AlgorithmSpec,
@@ -38,9 +39,9 @@ def build(n_flocks=2, **overrides):
 @pytest.mark.parametrize(
     ("algo", "algorithm", "buffer", "bound"),
     [
-        ("ddpg", FlockDDPG, CompactReplayBuffer, th.nn.Tanh),
-        ("ddpg-sb3", DDPG, ReplayBuffer, th.nn.Tanh),
-        ("td3", FlockTD3, CompactReplayBuffer, th.nn.Tanh),
+        ("ddpg", FlockDDPG, CompactReplayBuffer, InvertingBound),
+        ("ddpg-sb3", DDPG, ReplayBuffer, InvertingBound),
+        ("td3", FlockTD3, CompactReplayBuffer, InvertingBound),
         ("sac", SAC, CompactReplayBuffer, None),
     ],
 )
@@ -148,7 +149,7 @@ def test_an_algorithm_registered_from_outside_trains_saves_and_loads(tmp_path, b
 
 @pytest.mark.usefixtures("_clean_registry")
 def test_bc_coef_goes_to_a_registered_algorithm_that_has_it():
-    register_algorithm("cloned", AlgorithmSpec(FlockDDPG, FlockPolicy, action_bounds=("inverting", "tanh"), has_bc=True))
+    register_algorithm("cloned", AlgorithmSpec(FlockDDPG, FlockPolicy, action_bounds=("inverting",), has_bc=True))
     assert build(algo="cloned", bc_coef=3.0).bc_coef == 3.0
     with pytest.raises(SettingsError, match=re.escape("without algo ddpg, cloned and n_steps 1")):
         settings(algo="td3", bc_coef=3.0)

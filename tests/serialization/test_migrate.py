@@ -92,9 +92,7 @@ def with_earlier_defaults(values):
         "obstacle_separation_scale": None,
     }
     off = {"safety_filter": "off", "shared_detections": False}
-    network = {"action_bound": None, **values.get("network", {})}
-    groups = {"scenario": {**off, **scenario, "reward": reward}, "train_env": {**then, **train_env}, "network": network}
-    return {**values, **groups}
+    return {**values, "scenario": {**off, **scenario, "reward": reward}, "train_env": {**then, **train_env}}
 
 
 # -- format numbers --------------------------------------------------------------------------------------------------

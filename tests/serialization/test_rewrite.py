@@ -267,7 +267,7 @@ def test_a_part_of_a_config_keeps_its_keys_and_leading_comments_and_says_what_wa
     assert rewrite(path)
     assert path.read_text().startswith("# mine\nalgorithm:")
     values = yaml.safe_load(path.read_text())
-    assert list(values) == ["algorithm", "train_env", "seed", "scenario", "network"]
+    assert list(values) == ["algorithm", "train_env", "seed", "scenario"]
     assert values["algorithm"] == {"bc_coef": 10.0, "gamma": 0.9}
     assert values["train_env"].items() >= {"expert": "mpc", "flock_sizes": [3, 5], "action_repeat": 1}.items()
     assert values["scenario"].items() >= {"safety_filter": "off", "shared_detections": False}.items()

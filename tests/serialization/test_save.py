@@ -108,7 +108,7 @@ DIFFERENT = {
     "net_arch": ([64, 64], "network.net_arch = [64, 64]: the model has [64]"),
     "n_critics": (1, "network.n_critics = 1: the model has 2"),
     "action_layer": (8, "network.action_layer = 8: the model has 32"),
-    "action_bound": ("inverting", "network.action_bound = inverting: the model has tanh"),
+    "action_bound": ("tanh", "network.action_bound = tanh: the model has inverting"),
 }
 
 
