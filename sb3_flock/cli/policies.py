@@ -92,9 +92,9 @@ def _method(config: TrainingConfig) -> tuple[str, str]:
     if expert is None:
         return "RL", "reinforcement learning alone"
     name = expert.upper()
-    words = (
-        f"reinforcement learning with an {name} expert, which drives {config.train_env.expert_fraction:.0%} of the episodes"
-    )
+    words, fraction = f"reinforcement learning with an {name} expert", config.train_env.expert_fraction
+    if fraction:
+        words += f", which drives {fraction:.0%} of the episodes"
     if config.algorithm.bc_coef:
         words += f"; behavior cloning of its actions (weight {config.algorithm.bc_coef:g})"
     return f"RL+{name}", words

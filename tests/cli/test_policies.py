@@ -69,8 +69,7 @@ def test_a_name_shows_its_card(capsys):
     words = text_of(shown(capsys, "flock"))
     for expected in (
         "flock task 5 vehicles, 2 obstacles (walk), safety filter announce",
-        "method ddpg: reinforcement learning with an MPC expert, which drives 25% of the episodes; behavior cloning of its "
-        "actions (weight 10); motion channels",
+        "method ddpg: reinforcement learning with an MPC expert; behavior cloning of its actions (weight 10); motion channels",
         f"Results on {read_card('flock')['episodes']} episodes of the task:",
         f"file flock.zip, {shipped_policies()['flock'].stat().st_size / 1e6:.1f} MB",
     ):
