@@ -99,7 +99,8 @@ def test_a_flock_of_microcontrollers_flies_as_the_world_does(safety_filter):
         safety_filter=safety_filter, obstacle_filter=True, safety_margin=0.01, shared_detections=False
     )
     with library_of(source_of(policy, scenario), scenario) as library:
-        fly_as_the_world_does(library, scenario, policy)
+        # In float32 a neighbor that hardly moves away counts as one that approaches: with `motion` that slows a step down.
+        fly_as_the_world_does(library, scenario, policy, tolerance=2e-3 if safety_filter == "motion" else 1e-4)
 
 
 # -- the filter ----------------------------------------------------------------------------------------------------------
