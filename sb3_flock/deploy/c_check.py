@@ -76,12 +76,9 @@ class CLibrary:
         fields: list[Any] = [("now", measurement)]
         if scenario.motion_lag:
             fields += [("previous", measurement), ("ego_motion", "f4", 3)]
-        if scenario.safety_filter in {"heading", "announce"}:
-            fields += [("neighbor_headings", "f4", n_neighbors)]
-        further = filter_shapes(scenario)
-        if "neighbor_stds" in further:
-            fields += [("neighbor_stds", "f4", n_neighbors)]
-        if "own_speed" in further:
+        needed = filter_shapes(scenario)
+        fields += [(name, "f4", n_neighbors) for name in ("neighbor_headings", "neighbor_stds") if name in needed]
+        if "own_speed" in needed:
             fields += [("own_speed", "f4")]
         outputs = ["speed", "turn_rate"]
         if scenario.is_filtered:
