@@ -176,6 +176,10 @@ class VehicleDynamics(ABC):
     is_plain = False
     """Whether the vehicles move as the paper's unicycles, by compiled code: :meth:`step` is then not called."""
 
+    margin = 0.0
+    """Distance that the safety filter keeps beyond ``safety_margin``: how much farther the vehicles may come than the filter
+    assumes by their :meth:`stopping` [m]."""
+
     def __init__(self, settings: DynamicsSettings) -> None:
         self.settings = settings
         self.actuators = FlockValues(settings.actuators)

@@ -8,6 +8,7 @@ import numpy as np
 
 from sb3_flock.settings import RunError
 from sb3_flock.sim.actuators import follow
+from sb3_flock.sim.mujoco_view import View
 from sb3_flock.sim.randomization import FlockValues
 from sb3_flock.sim.simulators import Simulator, import_extra, register_simulator
 
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sb3_flock.sim.dynamics import DynamicsSettings
+    from sb3_flock.sim.world import World
 
 WHEEL_RADIUS = 0.0205
 """[m]; the sizes are about those of an e-puck2, which is 7 cm wide."""
@@ -40,6 +42,7 @@ class MuJoCo(Simulator):
 
     period = DRIVE_PERIOD
     actuators = ("speed_lag", "turn_lag", "max_acceleration", "max_turn_acceleration", "min_speed")
+    margin = 0.002  # the motors' delay, and arcs
 
     def __init__(self, settings: DynamicsSettings, n_flocks: int) -> None:
         super().__init__(settings, n_flocks)
@@ -47,6 +50,7 @@ class MuJoCo(Simulator):
         self._model: Any = self._mujoco.MjModel.from_xml_string(model_xml(settings.n_vehicles))
         self._states = [self._mujoco.MjData(self._model) for _ in range(n_flocks)]
         self._actuators = FlockValues(settings.actuators)
+        self._view: View | None = None
 
     def reset(self, poses: NDArray[np.float64]) -> None:
         """Place every vehicle, at rest, with its wheels on the floor."""
@@ -85,6 +89,14 @@ class MuJoCo(Simulator):
         velocities = self._bodies("qvel")
         return np.cos(self._headings) * velocities[..., 0] + np.sin(self._headings) * velocities[..., 1]
 
+    def image(self, world: World) -> NDArray[np.uint8]:
+        """The vehicles by MuJoCo's renderer, with the obstacles, the waypoint and the links.
+
+        :raises RunError: where MuJoCo finds no OpenGL
+        """
+        self._view = self._view or View(self._mujoco, self._model)
+        return self._view.image(self._states[0], world)
+
     def _bodies(self, name: str) -> NDArray[np.float64]:
         """Coordinates of all vehicles: the body's first, then the wheels', ``(flocks, vehicles, ...)``."""
         return np.stack([getattr(state, name).reshape(self.settings.n_vehicles, -1) for state in self._states])
@@ -102,27 +114,38 @@ def model_xml(n_vehicles: int) -> str:
 _MODEL = f"""
 <mujoco>
   <option timestep="{PERIOD}" integrator="implicitfast"/>
+  <visual><headlight ambient="0.4 0.4 0.4" diffuse="0.4 0.4 0.4" specular="0 0 0"/><map znear="0.005"/></visual>
+  <statistic extent="3"/>
+  <asset>
+    <texture name="sky" type="skybox" builtin="flat" rgb1="1 1 1" width="16" height="96"/>
+    <texture name="tiles" type="2d" builtin="checker" rgb1="0.95 0.95 0.95" rgb2="0.9 0.9 0.9" width="256" height="256"/>
+    <material name="floor" texture="tiles" texrepeat="2 2" texuniform="true"/>
+  </asset>
   <default>
     <geom solref="0.005 1"/>
     <default class="body">
-      <geom type="cylinder" size="0.035 0.015" pos="0 0 0.005" mass="0.15" condim="3" friction="0.3 0 0"/>
+      <geom type="cylinder" size="0.035 0.015" pos="0 0 0.005" mass="0.15" condim="3" friction="0.3 0 0" rgba="0 0.45 0.7 0.35"/>
     </default>
     <default class="wheel">
       <geom type="ellipsoid" size="{WHEEL_RADIUS} 0.003 {WHEEL_RADIUS}" mass="0.005" condim="3" friction="1 0 0"
-        contype="2" conaffinity="0"/>
+        contype="2" conaffinity="0" rgba="0.15 0.15 0.15 1"/>
     </default>
+    <default class="mark"><geom type="box" mass="0" contype="0" conaffinity="0" rgba="1 1 1 1"/></default>
     <default class="skid">
       <geom type="sphere" size="0.004" mass="0" condim="1" friction="0 0 0" contype="2" conaffinity="0"/>
     </default>
     <default class="motor"><velocity kv="0.003" forcerange="-0.006 0.006"/></default>
   </default>
   <worldbody>
-    <geom type="plane" size="0 0 1" condim="1" friction="0 0 0" contype="0" conaffinity="2"/>
+    <light pos="0 0 3" dir="0.3 0.2 -1" directional="true" castshadow="false" diffuse="0.5 0.5 0.5" specular="0 0 0"/>
+    <geom type="plane" size="0 0 1" material="floor" condim="1" friction="0 0 0" contype="0" conaffinity="2"/>
     {{bodies}}
   </worldbody>
   <actuator>{{motors}}</actuator>
 </mujoco>
 """
+
+_SPOKE = '<geom class="mark" size="0.015 0.004 0.0015"/>'
 
 _BODY = f"""
     <body pos="0 0 {WHEEL_RADIUS}">
@@ -130,6 +153,7 @@ _BODY = f"""
       <geom class="body"/>
       <geom class="skid" pos="0.028 0 {0.004 - WHEEL_RADIUS}"/>
       <geom class="skid" pos="-0.028 0 {0.004 - WHEEL_RADIUS}"/>
-      <body pos="0 {HALF_AXLE} 0"><joint name="left{{number}}" axis="0 1 0"/><geom class="wheel"/></body>
-      <body pos="0 -{HALF_AXLE} 0"><joint name="right{{number}}" axis="0 1 0"/><geom class="wheel"/></body>
+      <geom class="mark" size="0.01 0.002 0.001" pos="0.024 0 0.021"/>
+      <body pos="0 {HALF_AXLE} 0"><joint name="left{{number}}" axis="0 1 0"/><geom class="wheel"/>{_SPOKE}</body>
+      <body pos="0 -{HALF_AXLE} 0"><joint name="right{{number}}" axis="0 1 0"/><geom class="wheel"/>{_SPOKE}</body>
     </body>"""

@@ -38,6 +38,7 @@ class Navground(Simulator):
 
     period = PERIOD
     actuators = ("max_acceleration", "max_turn_acceleration")
+    margin = 0.001  # arcs
 
     def __init__(self, settings: DynamicsSettings, n_flocks: int) -> None:
         super().__init__(settings, n_flocks)

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sb3_flock.sim.dynamics import DynamicsSettings
+    from sb3_flock.sim.world import World
 
 
 class Simulator(ABC):
@@ -38,6 +39,10 @@ class Simulator(ABC):
     """The simulator's own time step [s], of which the task's is a multiple; ``None``: the task may have any."""
     actuators: ClassVar[tuple[str, ...]] = ("speed_lag", "max_acceleration")
     """Which fields of the scenario's ``actuators`` the simulator simulates, or its vehicles have anyway; others are refused."""
+
+    margin: ClassVar[float] = 0.0
+    """Distance that the safety filter keeps beyond the scenario's ``safety_margin``: how much farther the vehicles may come than
+    by ``speed_lag`` and ``max_acceleration``, along their headings [m]."""
 
     def __init__(self, settings: DynamicsSettings, n_flocks: int) -> None:
         self.settings, self.n_flocks = settings, n_flocks
@@ -64,6 +69,14 @@ class Simulator(ABC):
         """
         return None
 
+    def image(self, world: World) -> NDArray[np.uint8] | None:
+        """A picture of the first flock as the simulator shows it, ``(height, width, 3)``, the same size every time.
+
+        :param world: where the obstacles and the waypoint are, which no simulator knows
+        :return: ``None``: the simulator shows none
+        """
+        return None
+
 
 class SimulatorDynamics(VehicleDynamics):
     """The vehicles move as in the registered simulator that ``settings.dynamics`` names.
@@ -81,6 +94,7 @@ class SimulatorDynamics(VehicleDynamics):
     def __init__(self, settings: DynamicsSettings) -> None:
         super().__init__(settings)
         self._class = SIMULATORS[settings.dynamics]
+        self.margin = self._class.margin
         self._simulator: Simulator | None = None
         self._poses: NDArray[np.float64] | None = None
         for name in Actuators.model_fields:
@@ -118,7 +132,7 @@ class SimulatorDynamics(VehicleDynamics):
         simulator = self._simulator_of(len(positions))
         before = np.concatenate((positions, headings[..., None]), axis=-1)
         if self._poses is None or not np.array_equal(before, self._poses):
-            simulator.reset(before)
+            self._place(simulator, before)
         after = np.array(simulator.step(commands), dtype=np.float64)
         if after.shape != before.shape:
             raise ValueError(
@@ -137,6 +151,23 @@ class SimulatorDynamics(VehicleDynamics):
         """Restore :meth:`state_dict`; the simulator is reset at the next step, in which the vehicles start at rest."""
         super().load_state_dict(state)
         self._poses = None
+
+    def image(self, world: World) -> NDArray[np.uint8]:
+        """The simulator's own picture of the first flock, ``(height, width, 3)``.
+
+        :raises SettingsError: if it has none
+        """
+        simulator = self._simulator_of(world.n_flocks)
+        if self._poses is None:  # no step yet
+            self._place(simulator, np.concatenate((world.positions, world.headings[..., None]), axis=-1))
+        image = simulator.image(world)
+        if image is None:
+            raise SettingsError(f"view = simulator: the simulator {self.settings.dynamics} shows no pictures")
+        return image
+
+    def _place(self, simulator: Simulator, poses: NDArray[np.float64]) -> None:
+        simulator.reset(poses)
+        self._poses = poses
 
     def _simulator_of(self, n_flocks: int) -> Simulator:
         if self._simulator is None or self._simulator.n_flocks != n_flocks:

@@ -243,14 +243,16 @@ class World:
         :raises ActionError: for actions of another shape, or that are not finite
         :raises RuntimeError: before a reset or after the episode's last step
         """
-        safety = self.safety
         if self.steps >= self.scenario.max_cycles:
             raise RuntimeError("no episode is running: call reset() first")
         low, high = self._bounds
         given = np.asarray(actions, dtype=np.float64)
         check_actions(given, low.shape, "flock", "vehicle")
         executed = np.minimum(np.maximum(given, low), high)
+        safety = self.safety
         if safety.is_filtered:
+            if self.dynamics.margin:
+                safety = safety.model_copy(update={"safety_margin": safety.safety_margin + self.dynamics.margin})
             measured, stopping = self.sensors.latest or self.sense(), self.dynamics.stopping()
             executed = filter_actions(executed, measured, safety, self.frames, stopping=stopping)
         self.sensors.latest = None

@@ -8,21 +8,24 @@ import math
 from collections.abc import Callable, Iterator
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sb3_flock.evaluation.rollout import iter_rollout
 from sb3_flock.serialization.save import atomic_write
-from sb3_flock.settings import SettingsError
-from sb3_flock.sim import Scenario
+from sb3_flock.settings import SettingsError, suggest
+from sb3_flock.sim import Scenario, World
+from sb3_flock.sim.simulators import SIMULATORS, SimulatorDynamics
 from sb3_flock.viz.figures import FIGURES, check_figure_file, plot_trajectories, record_trajectory, save_as
 
 Frame = NDArray[np.uint8]
 
 _MAX_FPS = 50
 """Largest frame rate; at higher speeds steps are left out. A GIF shows no more."""
+VIEWS = ("plan", "simulator")
+"""What a video may show: the flock from above, or the simulator's own pictures."""
 _COLORS = 64
 """Colors of a GIF, chosen once from frames of the whole episode."""
 
@@ -35,6 +38,7 @@ def render(
     episode: int = 0,
     speed: float = 2.0,
     title: str = "sb3_flock",
+    view: str = "plan",
 ) -> Path:
     """Simulate one episode and write it in the format of the file's ending: ``.gif``, ``.mp4`` and ``.html`` are
     videos, ``.png`` and ``.svg`` the paper's figure of trajectories.
@@ -44,19 +48,21 @@ def render(
     :param seed: seed and number of the episode are those of :func:`~sb3_flock.evaluation.evaluate`
     :param speed: times real time
     :param title: of the web page
+    :param view: of a video: ``plan``, from above, or ``simulator``, as the simulator of ``scenario.dynamics`` shows it
     :return: the path
-    :raises SettingsError: for another kind of file, a folder that is not there, or a missing library
+    :raises SettingsError: for another view or kind of file, a folder that is not there, or a missing library
     :raises OSError: if the file cannot be written; an earlier file of that name stays
     """
     path = Path(path)
     check_video(path, speed)
+    check_view(view, path, scenario)
     with atomic_write(path) as temporary:
         if path.suffix in FIGURES:
             save_as(plot_trajectories(record_trajectory(policy, scenario, seed, episode)), temporary, path.suffix[1:])
             return path
         step = scenario.time_step / speed
         stride = math.ceil(1 / (_MAX_FPS * step))
-        frames = _frames(policy, scenario, seed, episode, stride)
+        frames = _frames(policy, scenario, seed, episode, stride, view)
         VIDEO_WRITERS[path.suffix](temporary, frames, 1 / (stride * step), title)
     return path
 
@@ -87,12 +93,29 @@ def check_speed(speed: float) -> None:
         raise SettingsError(f"speed = {speed:g}: from 0.01 to 1000 times real time is needed")
 
 
-def _frames(policy: Any, scenario: Scenario, seed: int, episode: int, stride: int) -> Iterator[Frame]:
-    from sb3_flock.envs.rendering import Renderer
+def check_view(view: str, path: Path, scenario: Scenario) -> None:
+    """Check the view of a video.
 
-    renderer = Renderer(scenario, "rgb_array", fps=0)
+    :raises SettingsError: if it is not accepted
+    """
+    if view not in VIEWS:
+        raise SettingsError(f"view = {view}: one of {', '.join(VIEWS)} is needed{suggest(view, VIEWS)}")
+    if view == "simulator" and scenario.dynamics not in SIMULATORS:
+        raise SettingsError(f"view = simulator: the dynamics are {scenario.dynamics}; a simulator is needed")
+    if view == "simulator" and path.suffix in FIGURES:
+        raise SettingsError(f"view = simulator: {path} shows paths; one of {', '.join(VIDEO_WRITERS)} is needed")
+
+
+def _frames(policy: Any, scenario: Scenario, seed: int, episode: int, stride: int, view: str) -> Iterator[Frame]:
+    def image_of(world: World) -> Frame:
+        return cast(SimulatorDynamics, world.dynamics).image(world)
+
+    if view == "plan":
+        from sb3_flock.envs.rendering import Renderer
+
+        image_of = Renderer(scenario, "rgb_array", fps=0).image
     for world in iter_rollout(policy, scenario, seed, episode):
-        frame = renderer.image(world)  # every step extends the trails
+        frame = image_of(world)  # every step extends the trails
         if world.steps % stride == 0:
             yield frame
 

@@ -98,6 +98,18 @@ def test_the_filter_has_the_mean_speed_of_a_step_or_the_simulators_own(registere
     np.testing.assert_array_equal(world.dynamics.stopping().speeds, [[0.04, 0.0]])
 
 
+def test_the_filter_keeps_a_simulators_margin_beyond_the_scenarios(registered):
+    """Two vehicles head for each other: where they stop is the separation with both margins."""
+    registered(margin=0.004)
+    for name, gap in (("unicycle", 0.103), ("fake", 0.107)):
+        scenario = Scenario(dynamics=name, n_obstacles=0, safety_filter="heading", safety_margin=0.003)
+        world = place(scenario.replace(n_vehicles=2), [(0, 0), (0.14, 0)], [0, -np.pi])
+        for _ in range(30):
+            world.step([[(0.15, 0.0)] * 2])
+        assert np.ptp(world.positions[0, :, 0]) == pytest.approx(gap, abs=1e-5)
+    assert world.safety.safety_margin == 0.003
+
+
 def test_what_a_simulator_does_not_have_is_one_line(registered):
     registered(period=0.03, actuators=("min_speed",))
     with pytest.raises(SettingsError, match=r"^time_step = 0.1: the simulator fake needs a multiple of 0.03 s$"):
