@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from sb3_flock.serialization.load import load_policy
     from sb3_flock.serialization.save import save_model
     from sb3_flock.sim import (
+        ObstacleMotion,
         RewardWeights,
         Scenario,
         Simulator,
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
         World,
         register_channel,
         register_dynamics,
+        register_obstacle_motion,
         register_reward_term,
         register_simulator,
     )
@@ -61,6 +63,7 @@ __all__ = [
     "FlockSACPolicy",
     "FlockTD3",
     "NeighborInclusiveReward",
+    "ObstacleMotion",
     "RewardWeights",
     "Scenario",
     "Simulator",
@@ -84,6 +87,7 @@ __all__ = [
     "register_controller",
     "register_dynamics",
     "register_metric",
+    "register_obstacle_motion",
     "register_reward_term",
     "register_simulator",
     "render",
@@ -104,6 +108,7 @@ _HOMES = {
     "FlockSACPolicy": "rl.policies",
     "FlockTD3": "rl.ddpg",
     "NeighborInclusiveReward": "rl.callbacks",
+    "ObstacleMotion": "sim",
     "RewardWeights": "sim",
     "Scenario": "sim",
     "Simulator": "sim",
@@ -126,6 +131,7 @@ _HOMES = {
     "register_controller": "controllers",
     "register_dynamics": "sim",
     "register_metric": "evaluation",
+    "register_obstacle_motion": "sim",
     "register_reward_term": "sim",
     "register_simulator": "sim",
     "render": "viz.video",

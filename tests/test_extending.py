@@ -128,6 +128,15 @@ def test_dynamics_of_ones_own_train_evaluate_and_render(tmp_path):
     assert (tmp_path / "extend_dynamics.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_a_world_of_ones_own_trains_evaluates_and_renders(tmp_path):
+    output = run("obstacles", 4100, cwd=tmp_path)
+    free = {name.strip(): int(share) for name, share in re.findall(r"^ *([\w ]+): tracking.*free (\d+)%", output, re.M)}
+    assert list(free) == ["flock", "trained with patrols"]
+    assert free["flock"] >= 90
+    assert "obstacle_motion: patrol" in next(tmp_path.glob("runs/*/config.yaml")).read_text()
+    assert (tmp_path / "extend_obstacles.png").read_bytes().startswith(b"\x89PNG")
+
+
 def test_a_simulator_of_ones_own_evaluates_and_renders(tmp_path):
     output = run("simulator", 20, cwd=tmp_path)
     errors = {name: float(error) for name, error in re.findall(r"(\S+): tracking error ([\d.]+) m", output)}

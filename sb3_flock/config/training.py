@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Annotated, Any
 
-from pydantic import BeforeValidator, Field, field_validator, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, field_validator, model_validator
 
 from sb3_flock.controllers import EXPERTS
 from sb3_flock.controllers.mpc import MPCConfig
@@ -15,7 +15,8 @@ from sb3_flock.rl.settings import Count, Width
 from sb3_flock.settings import NotNegative, Positive, Settings, SettingsError, suggest
 from sb3_flock.sim import Scenario
 from sb3_flock.sim.actuators import Actuators
-from sb3_flock.sim.dynamics import MAX_BODIES, ObstacleMotion
+from sb3_flock.sim.dynamics import MAX_BODIES
+from sb3_flock.sim.obstacles import WALK, check_obstacle_motion
 from sb3_flock.sim.randomization import check_ranges
 from sb3_flock.sim.sensors import SensorErrors
 from sb3_flock.sim.simulators import SIMULATORS
@@ -46,10 +47,10 @@ class TrainEnvConfig(Settings):
         max_length=16,
         description="vehicles per flock, one or several sizes; null: as in the task (paper: null)",
     )
-    obstacle_motions: tuple[ObstacleMotion, ...] | None = Field(
+    obstacle_motions: tuple[Annotated[str, AfterValidator(check_obstacle_motion)], ...] | None = Field(
         None,
         min_length=1,
-        max_length=2,
+        max_length=16,
         description="motions of the obstacles, each with flocks of its own; null: as in the task (paper: null)",
     )
     extra_obstacles: int = Field(0, ge=0, le=MAX_BODIES, description="obstacles added if the task has any (paper: 0)")
@@ -163,11 +164,11 @@ class TaskConfig(Settings):
                 scenario.detection_range,
             ),
         )
-        # Crossing obstacles meet the flock where it gathers: their square stays as it is.
-        narrow = scenario.obstacle_half_side * (1.0 if scenario.obstacle_starts else train_env.obstacle_arena_scale)
-        arenas = {"walk": narrow, "crossing": scenario.obstacle_half_side}
+        # The others, such as crossing ones, meet the flock where it gathers: their square stays as it is.
+        wide = scenario.obstacle_half_side
+        narrow = wide * (1.0 if scenario.obstacle_starts else train_env.obstacle_arena_scale)
         motions = [
-            changed.replace(obstacle_motion=motion, obstacle_arena=arenas[motion])
+            changed.replace(obstacle_motion=motion, obstacle_arena=narrow if motion == WALK else wide)
             for motion in train_env.obstacle_motions or (scenario.obstacle_motion,)
         ]
         sizes = train_env.flock_sizes or (scenario.n_vehicles,)

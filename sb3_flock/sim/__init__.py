@@ -5,6 +5,7 @@ from typing import Any
 from sb3_flock._renamed import renamed_member
 from sb3_flock.sim.dynamics import VehicleDynamics, register_dynamics
 from sb3_flock.sim.observation import Channel, observe, register_channel
+from sb3_flock.sim.obstacles import ObstacleMotion, register_obstacle_motion
 from sb3_flock.sim.reward import RewardWeights, mix_rewards, own_reward, register_reward_term, reward_terms
 from sb3_flock.sim.scenario import Scenario
 from sb3_flock.sim.sensing import Contacts, Sensing
@@ -14,6 +15,7 @@ from sb3_flock.sim.world import World, check_actions, episode_rng
 __all__ = [
     "Channel",
     "Contacts",
+    "ObstacleMotion",
     "RewardWeights",
     "Scenario",
     "Sensing",
@@ -27,6 +29,7 @@ __all__ = [
     "own_reward",
     "register_channel",
     "register_dynamics",
+    "register_obstacle_motion",
     "register_reward_term",
     "register_simulator",
     "reward_terms",

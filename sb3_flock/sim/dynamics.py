@@ -9,20 +9,19 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from sb3_flock.settings import NotNegative, Positive, Settings, suggest
 from sb3_flock.sim.actuators import Actuators
+from sb3_flock.sim.obstacles import WALK, check_obstacle_motion
 from sb3_flock.sim.randomization import FlockValues, own_rngs, rng_states, rngs_of
 
 if TYPE_CHECKING:
     from numpy.random import Generator
     from numpy.typing import NDArray
-
-ObstacleMotion = Literal["walk", "crossing"]
 
 MAX_BODIES = 1_000_000
 """Largest number of vehicles or obstacles. Each body adds at most 1 to an anchor, so this also bounds the observation."""
@@ -42,9 +41,10 @@ class DynamicsSettings(Settings):
     obstacle_turn_std: NotNegative = Field(
         2.0, description="standard deviation of an obstacle's turn rate, drawn each step [rad/s] (paper: not stated)"
     )
-    obstacle_motion: ObstacleMotion = Field(
-        "walk",
-        description="walk: random walk; crossing: straight through the flock from its far side (paper: walk)",
+    obstacle_motion: Annotated[str, AfterValidator(check_obstacle_motion)] = Field(
+        WALK,
+        description="walk: random walk; crossing: straight through the flock from its far side; or the name of a registered "
+        "motion (paper: walk)",
     )
 
     dynamics: str = Field(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sb3_flock.sim.dynamics import DynamicsSettings
-    from sb3_flock.sim.world import World
+    from sb3_flock.sim.sensing import SensingSettings
 
 WHEEL_RADIUS = 0.0205
 """[m]; the sizes are about those of an e-puck2, which is 7 cm wide."""
@@ -89,13 +89,14 @@ class MuJoCo(Simulator):
         velocities = self._bodies("qvel")
         return np.cos(self._headings) * velocities[..., 0] + np.sin(self._headings) * velocities[..., 1]
 
-    def image(self, world: World) -> NDArray[np.uint8]:
+    def image(self, obstacles: NDArray[np.float64], waypoint: NDArray[np.float64]) -> NDArray[np.uint8]:
         """The vehicles by MuJoCo's renderer, with the obstacles, the waypoint and the links.
 
         :raises RunError: where MuJoCo finds no OpenGL
         """
-        self._view = self._view or View(self._mujoco, self._model)
-        return self._view.image(self._states[0], world)
+        ranges = cast("SensingSettings", self.settings)  # the whole scenario
+        self._view = self._view or View(self._mujoco, self._model, ranges)
+        return self._view.image(self._states[0], self._bodies("qpos")[0, :, :2], obstacles, waypoint)
 
     def _bodies(self, name: str) -> NDArray[np.float64]:
         """Coordinates of all vehicles: the body's first, then the wheels', ``(flocks, vehicles, ...)``."""

@@ -11,7 +11,7 @@ from sb3_flock.settings import RunError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from sb3_flock.sim.world import World
+    from sb3_flock.sim.sensing import SensingSettings
 
 HEIGHT, WIDTH = 384, 512
 """Of the pictures [pixels]: multiples of 16 suit video codecs, and MuJoCo's buffer has 480 x 640."""
@@ -30,11 +30,12 @@ class View:
 
     :param mujoco: the module
     :param model: the ``MjModel`` of the flock
+    :param ranges: of links, and the obstacles' minimum separation
     :raises RunError: where MuJoCo finds no OpenGL
     """
 
-    def __init__(self, mujoco: Any, model: Any) -> None:
-        self._mujoco, self._model = mujoco, model
+    def __init__(self, mujoco: Any, model: Any, ranges: SensingSettings) -> None:
+        self._mujoco, self._model, self._ranges = mujoco, model, ranges
         try:
             self._renderer = mujoco.Renderer(model, HEIGHT, WIDTH)
         except Exception as error:  # of the library that MUJOCO_GL names, each has its own
@@ -45,24 +46,30 @@ class View:
         self._camera = mujoco.MjvCamera()
         self._camera.azimuth, self._camera.elevation = _AZIMUTH, _ELEVATION
 
-    def image(self, state: Any, world: World) -> NDArray[np.uint8]:
-        """The first flock, ``(HEIGHT, WIDTH, 3)``.
+    def image(
+        self, state: Any, positions: NDArray[np.float64], obstacles: NDArray[np.float64], waypoint: NDArray[np.float64]
+    ) -> NDArray[np.uint8]:
+        """A flock, ``(HEIGHT, WIDTH, 3)``.
 
         :param state: the ``MjData`` of the flock
+        :param positions: of its vehicles, ``(vehicles, 2)`` [m]
+        :param obstacles: ``(obstacles, 2)`` [m]
+        :param waypoint: ``(2,)`` [m]
         """
-        positions, kinds = world.positions[0], self._mujoco.mjtGeom
+        kinds = self._mujoco.mjtGeom
         middle = positions.mean(axis=0)
         self._camera.lookat = (*middle, 0.0)
         self._camera.distance = _MARGIN * max(0.5, 2 * np.linalg.norm(positions - middle, axis=1).max())
         for compute in (self._mujoco.mj_kinematics, self._mujoco.mj_camlight):
             compute(self._model, state)  # for bodies that were placed and did not move yet
         self._renderer.update_scene(state, self._camera)
-        separation = world.scenario.obstacle_separation
-        for x, y in world.obstacle_positions[0]:
+        for x, y in obstacles:
             self._add(kinds.mjGEOM_CYLINDER, (0.03, 0.05, 0), (x, y, 0.05), _OBSTACLE)
-            self._add(kinds.mjGEOM_CYLINDER, (separation, 0.001, 0), (x, y, 0.001), (*_OBSTACLE[:3], 0.3))
-        self._add(kinds.mjGEOM_CYLINDER, (0.006, 0.08, 0), (*world.waypoints[0], 0.08), _WAYPOINT)
-        near = np.linalg.norm(positions[:, None] - positions, axis=-1) < world.scenario.link_range
+            self._add(
+                kinds.mjGEOM_CYLINDER, (self._ranges.obstacle_separation, 0.001, 0), (x, y, 0.001), (*_OBSTACLE[:3], 0.3)
+            )
+        self._add(kinds.mjGEOM_CYLINDER, (0.006, 0.08, 0), (*waypoint, 0.08), _WAYPOINT)
+        near = np.linalg.norm(positions[:, None] - positions, axis=-1) < self._ranges.link_range
         for i, j in np.argwhere(np.triu(near, 1)):
             line = self._add(kinds.mjGEOM_CAPSULE, np.zeros(3), np.zeros(3), _LINK)
             ends = ((*positions[k], 0.003) for k in (i, j))

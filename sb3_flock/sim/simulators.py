@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sb3_flock.sim.dynamics import DynamicsSettings
-    from sb3_flock.sim.world import World
 
 
 class Simulator(ABC):
@@ -69,10 +68,11 @@ class Simulator(ABC):
         """
         return None
 
-    def image(self, world: World) -> NDArray[np.uint8] | None:
+    def image(self, obstacles: NDArray[np.float64], waypoint: NDArray[np.float64]) -> NDArray[np.uint8] | None:
         """A picture of the first flock as the simulator shows it, ``(height, width, 3)``, the same size every time.
 
-        :param world: where the obstacles and the waypoint are, which no simulator knows
+        :param obstacles: where they are, which no simulator knows, ``(obstacles, 2)`` [m]
+        :param waypoint: ``(2,)`` [m]
         :return: ``None``: the simulator shows none
         """
         return None
@@ -152,15 +152,19 @@ class SimulatorDynamics(VehicleDynamics):
         super().load_state_dict(state)
         self._poses = None
 
-    def image(self, world: World) -> NDArray[np.uint8]:
+    def image(
+        self, poses: NDArray[np.float64], obstacles: NDArray[np.float64], waypoint: NDArray[np.float64]
+    ) -> NDArray[np.uint8]:
         """The simulator's own picture of the first flock, ``(height, width, 3)``.
 
+        :param poses: of all flocks, for a simulator in which no vehicle has moved yet, ``(flocks, vehicles, 3)``
+        :param obstacles: as for :meth:`Simulator.image`
         :raises SettingsError: if it has none
         """
-        simulator = self._simulator_of(world.n_flocks)
-        if self._poses is None:  # no step yet
-            self._place(simulator, np.concatenate((world.positions, world.headings[..., None]), axis=-1))
-        image = simulator.image(world)
+        simulator = self._simulator_of(len(poses))
+        if self._poses is None:
+            self._place(simulator, poses)
+        image = simulator.image(obstacles, waypoint)
         if image is None:
             raise SettingsError(f"view = simulator: the simulator {self.settings.dynamics} shows no pictures")
         return image

@@ -14,6 +14,7 @@ from sb3_flock.settings import ActionError, Coordinate, NotNegative, Positive, S
 from sb3_flock.sim import dynamics, mujoco, navground  # noqa: F401 - the last two register simulators
 from sb3_flock.sim.backend import compiled
 from sb3_flock.sim.dynamics import DYNAMICS, VehicleDynamics, directions_of, wrap_angle
+from sb3_flock.sim.obstacles import OBSTACLE_MOTIONS
 from sb3_flock.sim.randomization import FlockValues, Ranges, check_ranges, draw
 from sb3_flock.sim.safety import SafetySettings, filter_actions
 from sb3_flock.sim.sensing import Bodies, Sensing, sense, to_body
@@ -27,9 +28,6 @@ if TYPE_CHECKING:
 _MAX_REDRAWS = 1000
 """Largest number of draws for one body's start before the arena counts as too crowded."""
 
-_SLOWEST_CROSSING = 0.6
-"""Lowest speed of a crossing obstacle [top speeds]: such an obstacle reaches the origin after 100 to 167 steps, when the
-flock is there."""
 
 Points = Annotated[tuple[tuple[Coordinate, Coordinate], ...], Field(min_length=1, max_length=10_000)]
 """Positions ``[[x, y], ...]`` [m]."""
@@ -163,6 +161,8 @@ class World:
         check_randomization(self.randomization, scenario)
         self.n_flocks = n_flocks
         self.sensors = Sensors(scenario, scenario, lambda: Bodies(self.positions, self.frames, self.obstacle_positions))
+        motion = OBSTACLE_MOTIONS.get(scenario.obstacle_motion)
+        self._obstacle_motion = motion(scenario) if motion else None
         self.dynamics: VehicleDynamics = DYNAMICS[scenario.dynamics](scenario)
         self.drawn = {}
         self.steps = scenario.max_cycles  # no episode is running before the first reset
@@ -218,14 +218,12 @@ class World:
         """
         if len(rngs) != self.n_flocks:
             raise ValueError(f"rngs has {len(rngs)} generators: one for each of the {self.n_flocks} flocks is needed")
-        scenario = self.scenario
         starts = [self._start(rng) for rng in rngs]
         self.positions, self.headings, self.obstacle_positions, self.obstacle_headings, self.waypoints = (
             np.stack(parts) for parts in zip(*starts, strict=True)
         )
-        walks = [self._walk(rng) for rng in rngs]
-        self.obstacle_speeds = np.stack([speeds for speeds, _ in walks], axis=1)
-        self.obstacle_turn_rates = np.stack([turns for _, turns in walks], axis=1) * scenario.obstacle_turn_std
+        controls = [self._obstacle_controls(rng) for rng in rngs]
+        self.obstacle_speeds, self.obstacle_turn_rates = (np.stack(parts, axis=1) for parts in zip(*controls, strict=True))
         if self.randomization:
             self._use(draw(self.randomization, rngs))
         self.sensors.reset(rngs)
@@ -360,14 +358,18 @@ class World:
         for i in range(scenario.n_vehicles):
             positions[i] = placed.draw_apart(rng, scenario.arena, "n_vehicles", scenario.n_vehicles, obstructed)
             placed.add(*positions[i].tolist())
-        placed = _Placed(scenario.obstacle_separation, positions.tolist())
-        if scenario.obstacle_motion == "crossing":
-            headings = rng.uniform(-np.pi, np.pi, scenario.n_vehicles)
-            waypoint = self._first_waypoint(rng)
-            return positions, headings, *self._far_side(rng, placed, waypoint), waypoint
+        placed, motion = _Placed(scenario.obstacle_separation, positions.tolist()), self._obstacle_motion
         obstacles = np.empty((scenario.n_obstacles, 2))
         obstacles[: len(given)] = given or np.empty((0, 2))
-        for o in range(len(given), scenario.n_obstacles):
+        others = range(len(given), scenario.n_obstacles)
+        if motion is not None:
+            start, where = motion.start, f"the starts of obstacle_motion = {scenario.obstacle_motion}"
+            headings = rng.uniform(-np.pi, np.pi, scenario.n_vehicles)
+            waypoint = self._first_waypoint(rng)
+            for o in others:
+                obstacles[o] = placed.draw(lambda: start(rng, waypoint), where, "n_obstacles", scenario.n_obstacles)
+            return positions, headings, obstacles, motion.headings(rng, obstacles, waypoint), waypoint
+        for o in others:
             obstacles[o] = placed.draw_apart(rng, scenario.obstacle_half_side, "n_obstacles", scenario.n_obstacles)
         headings = rng.uniform(-np.pi, np.pi, scenario.n_vehicles)
         obstacle_headings = rng.uniform(-np.pi, np.pi, scenario.n_obstacles)
@@ -377,32 +379,25 @@ class World:
         drawn = rng.uniform(-self.scenario.arena, self.scenario.arena, 2)
         return drawn if self.scenario.waypoint_route is None else np.array(self.scenario.waypoint_route[0])
 
-    def _far_side(
-        self, rng: Generator, placed: _Placed, waypoint: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Starts and headings of crossing obstacles: opposite the waypoint, aimed at where the flock will be."""
-        scenario, count = self.scenario, self.scenario.n_obstacles
-        radius, behind = scenario.obstacle_half_side, math.atan2(-waypoint[1], -waypoint[0])
-
-        def point() -> NDArray[np.float64]:
-            angle = behind + rng.uniform(-np.pi / 4, np.pi / 4)
-            return radius * np.array([math.cos(angle), math.sin(angle)])
-
-        given = scenario.obstacle_starts or ()
-        starts = np.empty((count, 2))
-        starts[: len(given)] = given or np.empty((0, 2))
-        for o in range(len(given), count):
-            starts[o] = placed.draw(point, f"a quarter of a circle of radius {radius} m", "n_obstacles", count)
-        aims = rng.uniform(-scenario.link_range, scenario.link_range, (count, 2)) - starts
-        return starts, np.arctan2(aims[:, 1], aims[:, 0])
-
-    def _walk(self, rng: Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """The obstacles' speeds [m/s] and turn rates [standard deviations] of a whole episode, each ``(steps, obstacles)``."""
-        shape = (self.scenario.max_cycles, self.scenario.n_obstacles)
-        top = self.scenario.obstacle_max_speed
-        if self.scenario.obstacle_motion == "crossing":
-            return np.broadcast_to(rng.uniform(_SLOWEST_CROSSING * top, top, shape[1]), shape), np.zeros(shape)
-        return rng.uniform(0.0, top, shape), rng.normal(0.0, 1.0, shape)
+    def _obstacle_controls(self, rng: Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The obstacles' speeds [m/s] and turn rates [rad/s] of a whole episode, each ``(steps, obstacles)``."""
+        scenario, motion = self.scenario, self._obstacle_motion
+        shape, top = (scenario.max_cycles, scenario.n_obstacles), scenario.obstacle_max_speed
+        if motion is None:
+            return rng.uniform(0.0, top, shape), rng.normal(0.0, 1.0, shape) * scenario.obstacle_turn_std
+        speeds, turn_rates = motion.controls(rng)
+        for name, values, bounds in (("speeds", speeds, (0.0, top)), ("turn rates", turn_rates, (-np.inf, np.inf))):
+            if (
+                np.shape(values) != shape
+                or not np.isfinite(values).all()
+                or (values < bounds[0]).any()
+                or (values > bounds[1]).any()
+            ):
+                raise ValueError(
+                    f"obstacle_motion = {scenario.obstacle_motion}: finite {name} of shape {shape} from {bounds[0]:g} to "
+                    f"{bounds[1]:g} are needed"
+                )
+        return speeds, turn_rates
 
 
 def waypoints_ahead(

@@ -108,7 +108,8 @@ def check_view(view: str, path: Path, scenario: Scenario) -> None:
 
 def _frames(policy: Any, scenario: Scenario, seed: int, episode: int, stride: int, view: str) -> Iterator[Frame]:
     def image_of(world: World) -> Frame:
-        return cast(SimulatorDynamics, world.dynamics).image(world)
+        poses = np.concatenate((world.positions, world.headings[..., None]), axis=-1)
+        return cast(SimulatorDynamics, world.dynamics).image(poses, world.obstacle_positions[0], world.waypoints[0])
 
     if view == "plan":
         from sb3_flock.envs.rendering import Renderer

@@ -21,8 +21,12 @@ scenario = Scenario(n_vehicles=2, dynamics="mujoco", obstacle_starts=[[0.3, 0.1]
 world = World(scenario)
 world.reset([episode_rng(0, 0)])
 
+def draw():
+    poses = np.concatenate((world.positions, world.headings[..., None]), axis=-1)
+    return world.dynamics.image(poses, world.obstacle_positions[0], world.waypoints[0])
+
 def colors():
-    image = world.dynamics.image(world).astype(int)
+    image = draw().astype(int)
     assert image.shape == ({height}, {width}, 3)
     red, green, blue = np.moveaxis(image, -1, 0)
     pink = (red > blue) & (blue > green + 20)
@@ -44,7 +48,7 @@ linked, apart = placed(-0.06, 0.06), placed(-0.1, 0.1)
 assert linked[0] > 500 and linked[2] > 50, linked
 assert linked[1] - apart[1] > 50, (linked, apart)  # a link of this color
 before = world.positions.copy(), world.dynamics._simulator._states[0].qacc_warmstart.copy()
-world.dynamics.image(world)
+draw()
 assert (before[1] == world.dynamics._simulator._states[0].qacc_warmstart).all()  # a look changes nothing
 print("drawn")
 """
@@ -88,7 +92,7 @@ def test_without_opengl_one_line_names_what_is_needed():
                 raise ValueError("no display\nmore")
 
     with pytest.raises(RunError, match=r"MuJoCo cannot draw \(no display\).* MUJOCO_GL=egl"):
-        View(Broken, None)
+        View(Broken, None, Scenario())
 
 
 @pytest.mark.parametrize(
