@@ -21,7 +21,7 @@ BATCH = 250
 
 
 def rollout(
-    controller: Controller,
+    policy: Any,
     scenario: Scenario,
     episodes: int,
     seed: int,
@@ -31,6 +31,7 @@ def rollout(
 ) -> dict[str, NDArray[np.float64]]:
     """Simulate episodes 0 ... ``episodes - 1`` of a seed.
 
+    :param policy: as in :func:`evaluate`
     :param batch: episodes simulated at once; it does not change the results
     :param watch: called with the world of the first batch at the start and after each step
     :param metrics: what is measured; every registered metric by default
@@ -39,6 +40,7 @@ def rollout(
     """
     for name, value, least in (("episodes", episodes, 1), ("seed", seed, 0), ("batch", batch, 1)):
         check_integer(name, value, least)
+    controller = as_controller(policy, scenario)
     results = []
     for start in range(0, episodes, batch):
         rngs = [episode_rng(seed, episode) for episode in range(start, min(start + batch, episodes))]
@@ -163,5 +165,5 @@ def evaluate(
             f"the safety filter guarantees no separation with {', '.join(scenario.guarantee_limits)}", stacklevel=2
         )
     kinds = find_metrics(metrics)
-    values = rollout(as_controller(policy, scenario), scenario, episodes, seed, batch, metrics=kinds)
+    values = rollout(policy, scenario, episodes, seed, batch, metrics=kinds)
     return summarize(values, {kind.name: kind for kind in kinds})

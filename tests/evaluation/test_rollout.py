@@ -96,6 +96,13 @@ def test_a_loaded_policy_is_checked_against_the_scenario():
         as_controller(policy, policy.scenario.replace(link_range=0.2))
 
 
+def test_a_rollout_takes_a_policy_as_evaluate_does():
+    policy = load_policy("ddpg")
+    scenario = policy.scenario.replace(max_cycles=20)
+    values = rollout(policy, scenario, 3, 0)["tracking_error"]
+    assert values.mean() == pytest.approx(evaluate(policy, scenario, 3)["tracking_error"].mean)
+
+
 def test_one_episode_is_the_batchs_episode_of_that_number():
     worlds = [
         (world.steps, world.positions[0].copy(), world.waypoints[0].copy())
