@@ -28,6 +28,7 @@ EXPERT_PRESETS: dict[str, dict[str, Any]] = {
         "algorithm.bc_coef": 10.0,
         "algorithm.utd_ratio": 0.06,
         "algorithm.action_noise_std": 0.1,
+        "algorithm.final_action_noise_std": 0.05,
         "network.channels": (32,),
         "network.action_bound": "tanh",
         "total_timesteps": 200_000,

@@ -192,7 +192,7 @@ def uses_compact_buffer(settings: ModelSettings) -> bool:
 
 def _action_noise(settings: ModelSettings) -> ActionNoise | None:
     """Gaussian noise on the normalized action."""
-    start, end = settings.algorithm.action_noise_std, settings.algorithm.final_action_noise_std
+    start, end = settings.algorithm.action_noise_stds
     if not ALGORITHMS[settings.algo].has_action_noise or max(start, end) == 0:
         return None
     from stable_baselines3.common.noise import NormalActionNoise

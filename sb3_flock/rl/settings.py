@@ -72,6 +72,12 @@ class AlgorithmConfig(Settings):
         0.4,
         description="standard deviation of the exploration noise at the start [half the action range] (paper: not stated)",
     )
-    final_action_noise_std: NotNegative = Field(
-        0.05, description="exploration noise at the end, reached linearly (paper: not stated)"
+    final_action_noise_std: NotNegative | None = Field(
+        None, description="exploration noise at the end, reached linearly; null: as at the start (paper: not stated)"
     )
+
+    @property
+    def action_noise_stds(self) -> tuple[float, float]:
+        """The exploration noise at the start and at the end [half the action range]."""
+        start, end = self.action_noise_std, self.final_action_noise_std
+        return start, start if end is None else end

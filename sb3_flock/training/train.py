@@ -304,7 +304,7 @@ def _run(
         ),
     ]
     if model.action_noise is not None:
-        parts.append(LinearNoiseDecay(config.algorithm.action_noise_std, config.algorithm.final_action_noise_std))
+        parts.append(LinearNoiseDecay(*config.algorithm.action_noise_stds))
     model.set_logger(make_logger(folder, model.num_timesteps))
     try:
         with quiet_writer_thread():

@@ -20,6 +20,7 @@ from sb3_flock.rl.registry import (
     policy_kwargs,
     register_algorithm,
 )
+from sb3_flock.rl.settings import AlgorithmConfig
 from sb3_flock.serialization.yaml_io import load_config
 from sb3_flock.settings import SettingsError
 from sb3_flock.sim import Scenario
@@ -70,7 +71,13 @@ def test_the_settings_reach_the_model():
     assert not model.replay_buffer.mirror_augmentation
     assert model.replay_buffer.expert_actions is not None
     assert model.bc_coef == 2.0
-    assert build(action_noise_std=0, final_action_noise_std=0).action_noise is None
+    assert build(action_noise_std=0).action_noise is None
+    np.testing.assert_array_equal(build(action_noise_std=0, final_action_noise_std=0.1).action_noise._sigma, [0, 0])
+
+
+@pytest.mark.parametrize(("stds", "expected"), [((0.3, None), (0.3, 0.3)), ((0.3, 0.1), (0.3, 0.1)), ((0.3, 0), (0.3, 0))])
+def test_the_noise_stays_unless_its_end_is_given(stds, expected):
+    assert AlgorithmConfig(action_noise_std=stds[0], final_action_noise_std=stds[1]).action_noise_stds == expected
 
 
 @pytest.mark.parametrize("algo", ["ddpg", "td3", "sac"])

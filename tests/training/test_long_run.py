@@ -1,4 +1,4 @@
-"""A training of 24 million vehicle-steps in one process leaves nothing behind: ``pytest -m slow -s tests/training/test_long_run.py``."""
+"""A training of 24 million vehicle-steps in one process leaves nothing behind (``pytest -m slow``)."""
 
 import gc
 import os

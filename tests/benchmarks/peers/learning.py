@@ -126,6 +126,7 @@ def train_benchmarl(name: str, algorithm: str, seed: int, seconds: float) -> tup
     import torch
     from benchmarl.algorithms import IddpgConfig, MaddpgConfig
     from benchmarl.environments import PettingZooTask
+    from benchmarl.environments.pettingzoo import common
     from benchmarl.experiment import Callback, Experiment, ExperimentConfig
     from benchmarl.models.mlp import MlpConfig
     from tensordict import TensorDict
@@ -165,16 +166,10 @@ def train_benchmarl(name: str, algorithm: str, seed: int, seconds: float) -> tup
     config.loggers = []
     task = {"spread": PettingZooTask.SIMPLE_SPREAD, "multiwalker": PettingZooTask.MULTIWALKER}[name].get_from_yaml()
 
-    def get_env_fun(num_envs: int, continuous_actions: bool, seed: int | None, device: Any) -> Callable[[], Any]:
-        groups = {"agents": make_env(name).possible_agents}
-        # torchrl's own maker looks for MPE in PettingZoo, which MPE2 has left.
-        return lambda: PettingZooWrapper(
-            make_env(name), group_map=groups, return_state=False, use_mask=False, categorical_actions=False, seed=seed, device=device
-        )
+    def make_torchrl_env(seed: int | None, device: Any, return_state: bool, **others: Any) -> Any:
+        return PettingZooWrapper(make_env(name), return_state=return_state, seed=seed, device=device)
 
-    task.get_env_fun = get_env_fun
-    task.has_state = lambda: False
-    task.state_spec = lambda env: None
+    common.PettingZooEnv = make_torchrl_env  # torchrl's own looks for MPE in PettingZoo, which it has left for MPE2
     model = MlpConfig.get_from_yaml()
     model.num_cells, model.activation_class = NET_ARCH, torch.nn.ReLU
     with tempfile.TemporaryDirectory() as folder:
@@ -193,10 +188,12 @@ def train_benchmarl(name: str, algorithm: str, seed: int, seconds: float) -> tup
         with contextlib.suppress(Done):
             experiment.run()
 
+    (group,) = experiment.group_map
+
     def act(observations: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         agents = TensorDict({"observation": torch.as_tensor(np.stack(list(observations.values())))}, [len(observations)])
         with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-            chosen = experiment.policy(TensorDict({"agents": agents}, []))["agents", "action"].numpy()
+            chosen = experiment.policy(TensorDict({group: agents}, []))[group, "action"].numpy()
         return dict(zip(observations, chosen, strict=True))
 
     return act, {"transitions": experiment.total_frames * N_AGENTS, "updates": until.updates}
@@ -212,7 +209,10 @@ def table(path: Path) -> str:
         run = json.loads(line)
         scores[run["env"]][run["algorithm"]].append(run["score"])
         counts[run["env"], run["algorithm"]].append(run["transitions"])
-    rows = ["| env | algorithm | seeds | return of an agent (IQM) | 95 % interval | transitions |", "|---|---|---|---|---|---|"]
+    rows = [
+        "| env | algorithm | seeds | return of an agent (IQM) | 95 % interval | transitions |",
+        "|---|---|---|---|---|---|",
+    ]
     for env, runs in scores.items():
         matrix = {name: np.array(values)[:, None] for name, values in runs.items()}
         points, intervals = library.get_interval_estimates(matrix, lambda x: np.array([metrics.aggregate_iqm(x)]), reps=5000)
