@@ -379,9 +379,8 @@ class Processes:
 
 
 @needs_ros
-@pytest.mark.slow
 @pytest.mark.timeout(1200)
-@pytest.mark.parametrize("seconds", [60, 600])
+@pytest.mark.parametrize("seconds", [60, pytest.param(600, marks=pytest.mark.slow)])
 def test_five_processes_at_10_hz_decide_as_a_rollout(seconds, ros, capsys):
     policy = load_policy("flock")
     scenario = policy.scenario.replace(safety_filter="announce", max_cycles=10 * seconds)
