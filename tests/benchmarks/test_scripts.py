@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 HERE = Path(__file__).parent
-WITH_HELP = ("sweep_scale", "time_to_paper", "tune_controllers", "peers/training", "peers/worlds")
+WITH_HELP = ("sweep_scale", "time_to_paper", "tune_controllers", "peers/learning", "peers/training", "peers/worlds")
 OTHERS = ("full_sight", "plot_crowd", "value_of_spacing")
 PARTS = ("products", "peers/flax_networks")
 """Modules that benchmarks import."""

@@ -17,7 +17,7 @@ from sb3_flock.settings import SettingsError
         (["evaluate"], ["POLICY or --controller NAME"]),
         (["evaluate", "x.zip", "--controller", "orca"], ["not both"]),
         (["evaluate", "--controller", "boids"], ["controller = 'boids'", "olfati-saber"]),
-        (["evaluate", "--controller", "random", "--obstacle-motion", "siege"], ["obstacle_motion = 'siege'", "crossing"]),
+        (["evaluate", "--controller", "random", "--obstacle-motion", "siege"], ["obstacle_motion = siege", "crossing"]),
         (["evaluate", "no/such.zip"], ["no/such.zip", "no such file or run folder"]),
         (["evaluate", __file__], ["damaged or not a policy file"]),
         (["evaluate", os.path.dirname(__file__)], ["no best_model.zip"]),

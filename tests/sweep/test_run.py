@@ -128,6 +128,7 @@ def test_a_sweep_with_a_killed_driver_resumes_to_the_same_policies(tmp_path, kil
     assert results(out) == rows
 
 
+@pytest.mark.slow
 def test_the_trial_of_a_killed_node_resumes_on_the_other_node(tmp_path):
     from ray.cluster_utils import Cluster
 

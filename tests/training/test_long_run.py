@@ -30,13 +30,14 @@ class Footprint(BaseCallback):
         return True
 
 
-def footprints(tmp_path, total):
-    """A training with env, buffer, updates, evaluations, checkpoints and the expert; its footprints in 24 parts."""
-    config = tiny(
-        tmp_path, total_timesteps=total, n_flocks=400, max_cycles=200, learning_starts=2000, buffer_size=100_000,
-        batch_size=64, utd_ratio=1 / 300, eval_freq=total // 24, n_eval_episodes=50, n_test_episodes=1,
-        save_freq=total // 12, keep_checkpoints=2, n_obstacles=2,
-    )  # fmt: skip
+def footprints(tmp_path, total, **changes):
+    """A training with env, buffer, updates, evaluations and checkpoints; its footprints in 24 parts."""
+    settings = {
+        "total_timesteps": total, "n_flocks": 400, "max_cycles": 200, "n_obstacles": 2, "learning_starts": 2000,
+        "buffer_size": 100_000, "batch_size": 64, "utd_ratio": 1 / 300, "eval_freq": total // 24, "n_eval_episodes": 50,
+        "n_test_episodes": 1, "save_freq": total // 12,
+    }  # fmt: skip
+    config = tiny(tmp_path, **{**settings, **changes})
     footprint = Footprint(total, 24)
     train(config, quiet(), callbacks=[footprint])
     assert len(footprint.samples) == 24
@@ -54,7 +55,8 @@ def check(samples, share):
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
 def test_a_short_run_leaves_no_file_and_no_thread(tmp_path):
-    check(footprints(tmp_path, 60_000), share=0.3)
+    smaller = {"n_flocks": 20, "max_cycles": 40, "buffer_size": 2000, "n_eval_episodes": 5}
+    check(footprints(tmp_path, 12_000, **smaller), share=0.3)
 
 
 @pytest.mark.slow
