@@ -180,6 +180,12 @@ _ALIASES = {"lr": "learning_rate", "timesteps": "total_timesteps", "n_envs": "n_
 """What other libraries call our parameters."""
 
 
+def first_line(error: Exception) -> str:
+    """An error's first line, shortened."""
+    lines = str(error).strip().splitlines()
+    return lines[0][:200] if lines else type(error).__name__
+
+
 def suggest(name: str, known: Iterable[str]) -> str:
     """A hint ``; did you mean ...?`` for a mistyped name, or an empty string."""
     by_tail = {candidate.split(".")[-1]: candidate for candidate in known}

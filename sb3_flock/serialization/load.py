@@ -34,7 +34,7 @@ from sb3_flock.rl.registry import ALGORITHMS, build_model, fewest_parameters, po
 from sb3_flock.serialization.archive import check_size, read_member
 from sb3_flock.serialization.migrate import FORMAT, MEMBER, check_format, migrate_config, migrate_weights
 from sb3_flock.serialization.yaml_io import load_config
-from sb3_flock.settings import SettingsError, UserError, format_value
+from sb3_flock.settings import SettingsError, UserError, first_line, format_value
 from sb3_flock.sim import Scenario, check_actions
 
 _CHECKPOINT = re.compile(r"rl_model_(\d+)_steps\.zip")
@@ -360,9 +360,3 @@ def _observation_fields(channels: int, n_anchors: int, _: int) -> dict[str, Any]
 
 def _numbers(text: str) -> list[float]:
     return [float(word) for word in text.strip("[] ").split()]
-
-
-def first_line(error: Exception) -> str:
-    """An error's first line, shortened."""
-    lines = str(error).strip().splitlines()
-    return lines[0][:200] if lines else type(error).__name__

@@ -20,11 +20,11 @@ from sb3_flock.config.training import TrainingConfig
 from sb3_flock.envs.vec_env import make_vec_env
 from sb3_flock.rl.registry import build_model
 from sb3_flock.serialization.archive import check_clock, read_member, read_text
-from sb3_flock.serialization.load import PolicyError, first_line, load_policy
+from sb3_flock.serialization.load import PolicyError, load_policy
 from sb3_flock.serialization.migrate import FORMAT, MEMBER, format_of, migrate_card, migrate_config
 from sb3_flock.serialization.save import atomic_write
 from sb3_flock.serialization.yaml_io import check_groups, read_yaml, to_yaml
-from sb3_flock.settings import SettingsError, UserError, leaf_paths
+from sb3_flock.settings import SettingsError, UserError, first_line, leaf_paths
 
 _CHECKPOINT = "training.json"
 """A member that only checkpoints have."""

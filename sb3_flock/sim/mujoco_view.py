@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sb3_flock.settings import RunError
+from sb3_flock.settings import RunError, first_line
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -40,7 +40,7 @@ class View:
             self._renderer = mujoco.Renderer(model, HEIGHT, WIDTH)
         except Exception as error:  # of the library that MUJOCO_GL names, each has its own
             raise RunError(
-                f"view = simulator: MuJoCo cannot draw ({str(error).splitlines()[0]}); without a screen the environment variable "
+                f"view = simulator: MuJoCo cannot draw ({first_line(error)}); without a screen the environment variable "
                 "MUJOCO_GL=egl or MUJOCO_GL=osmesa is needed"
             ) from None
         self._camera = mujoco.MjvCamera()

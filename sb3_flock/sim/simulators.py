@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 
-from sb3_flock.settings import SettingsError
+from sb3_flock.settings import SettingsError, first_line
 from sb3_flock.sim.actuators import Actuators
 from sb3_flock.sim.dynamics import DYNAMICS, Stopping, VehicleDynamics, directions_of, wrap_angle
 
@@ -211,9 +211,11 @@ def register_simulator(name: str) -> Callable[[_Simulator], _Simulator]:
 def import_extra(module: str, extra: str) -> Any:
     """A module of an optional dependency.
 
-    :raises SettingsError: if it is not installed
+    :raises SettingsError: if it is not installed, or its import fails
     """
     try:
         return importlib.import_module(module)
     except ImportError as error:
         raise SettingsError(f"dynamics = {extra}: {error.name} is needed: pip install 'sb3_flock[{extra}]'") from None
+    except Exception as error:  # MuJoCo imports the OpenGL library that MUJOCO_GL names
+        raise SettingsError(f"dynamics = {extra}: {module} cannot be imported: {first_line(error)}") from None

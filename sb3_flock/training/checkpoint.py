@@ -37,9 +37,10 @@ from sb3_flock.rl.compiled_update import compiled_kernels
 from sb3_flock.rl.ddpg import FlockTD3
 from sb3_flock.rl.registry import ALGORITHMS, uses_compact_buffer
 from sb3_flock.serialization.archive import check_size, read_member
-from sb3_flock.serialization.load import PolicyError, checkpoint_paths, first_line, read_tensors
+from sb3_flock.serialization.load import PolicyError, checkpoint_paths, read_tensors
 from sb3_flock.serialization.migrate import MEMBER, check_format, migrate_config, migrate_state
 from sb3_flock.serialization.save import save_model, versions
+from sb3_flock.settings import first_line
 from sb3_flock.sim.backend import compiled
 from sb3_flock.training.checkpoint_schema import check_state
 

@@ -10,7 +10,7 @@ from sb3_flock.evaluation.rollout import rollout
 from sb3_flock.settings import SettingsError
 from sb3_flock.sim import Scenario, Simulator, World, episode_rng, register_simulator
 from sb3_flock.sim.dynamics import DYNAMICS
-from sb3_flock.sim.simulators import SIMULATORS
+from sb3_flock.sim.simulators import SIMULATORS, import_extra
 from sb3_flock.sim.unicycle import Unicycle
 from tests.helpers import place
 
@@ -150,3 +150,11 @@ def test_a_missing_library_is_one_line_with_its_extra(name, module, monkeypatch)
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(SettingsError, match=rf"dynamics = {name}: {module} is needed: pip install 'sb3_flock\[{name}\]'"):
         World(Scenario(dynamics=name)).reset([episode_rng(0, 0)])
+
+
+def test_an_import_that_fails_is_one_line(tmp_path, monkeypatch):
+    """As MuJoCo's where MUJOCO_GL names a library that is not there."""
+    (tmp_path / "broken_simulator.py").write_text("raise AttributeError('no OpenGL\\nmore')")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(SettingsError, match=r"^dynamics = mujoco: broken_simulator cannot be imported: no OpenGL$"):
+        import_extra("broken_simulator", "mujoco")

@@ -1,4 +1,4 @@
-"""How well agents fly after the same minutes of training, on tasks of other people: sb3_flock's parts beside BenchMARL.
+"""How well agents act after the same minutes of training, on tasks of other people: sb3_flock's parts beside BenchMARL.
 
 Run by the Python of the peers' own environment (requirements.txt beside this file, and sb3_flock itself). The first form trains
 and prints one line of JSON; the second one prints a table of such lines::
@@ -10,8 +10,9 @@ and prints one line of JSON; the second one prints a table of such lines::
 ``maddpg`` are BenchMARL's, with one policy for all agents, whose critic sees one agent or all of them. ``ddpg`` is SB3's DDPG and
 ``td3`` is ``FlockTD3``, each in ``flatten``'s vector env with the neighbor-inclusive reward and a ``CompactReplayBuffer``: every
 agent is every other one's neighbor. All have the same networks, learning rate, discount, transitions in a minibatch, updates
-for each transition, and one thread. What else there is, such as exploration, has each library's default. The score is the
-mean return of an agent over episodes of the unwrapped env, with the last policy and without exploration.
+for each transition, and one thread. Minutes are those of the processor, so that other work on the machine takes none away. What
+else there is, such as exploration, has each library's default. The score is the mean return of an agent over episodes of the
+unwrapped env, with the last policy and without exploration.
 """
 
 from __future__ import annotations
@@ -91,7 +92,7 @@ def train_ours(name: str, algorithm: str, seed: int, seconds: float) -> tuple[Ac
         """Ends the training after its time."""
 
         def _on_step(self) -> bool:
-            return time.perf_counter() - started < seconds
+            return time.process_time() - started < seconds
 
     env = flatten(AllAreNeighbors(make_env(name)), n_copies=COPIES, seed=seed)
     n_actions = env.action_space.shape[0]
@@ -110,7 +111,7 @@ def train_ours(name: str, algorithm: str, seed: int, seconds: float) -> tuple[Ac
         replay_buffer_class=CompactReplayBuffer,
         seed=seed,
     )
-    started = time.perf_counter()
+    started = time.process_time()
     model.learn(10**9, CallbackList([NeighborInclusiveReward(0.5), Until()]))
     counts = {"transitions": model.num_timesteps, "updates": model._n_updates}
 
@@ -147,7 +148,7 @@ def train_benchmarl(name: str, algorithm: str, seed: int, seconds: float) -> tup
             self.updates += 1
 
         def on_train_end(self, training_td: Any, group: str) -> None:
-            if time.perf_counter() - started >= seconds:
+            if time.process_time() - started >= seconds:
                 raise Done
 
     config = ExperimentConfig.get_from_yaml()
@@ -184,7 +185,7 @@ def train_benchmarl(name: str, algorithm: str, seed: int, seconds: float) -> tup
         until = Until()  # added late, as an experiment pickles the callbacks that it is made with
         until.experiment = experiment
         experiment.callbacks.append(until)
-        started = time.perf_counter()
+        started = time.process_time()
         with contextlib.suppress(Done):
             experiment.run()
 
