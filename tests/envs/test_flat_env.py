@@ -126,6 +126,26 @@ def test_an_env_needs_no_render_mode_and_no_metadata(monkeypatch):
     assert env.reset().shape == (2 * N, 3)
 
 
+class Optional(Scripted):
+    """Each reset's infos hold its options."""
+
+    def reset(self, seed=None, options=None):
+        observations, infos = super().reset(seed, options)
+        return observations, {name: {"options": options} for name in infos}
+
+
+@pytest.mark.parametrize("num_cpus", [0, 2])
+def test_the_options_of_a_reset_reach_every_copy_for_one_reset(num_cpus):
+    env = flatten(Optional(), 2, num_cpus=num_cpus, seed=0)
+    env.set_options({"wind": 3})
+    found = []
+    for options in (None, None, {"wind": 4}):
+        env.reset(options=options)
+        found.append([info["options"] for info in env.reset_infos if info])
+    env.close()
+    assert found == [[{"wind": 3}] * 6, [None] * 6, [{"wind": 4}] * 6]
+
+
 @pytest.mark.parametrize("num_cpus", [0, 2])
 def test_the_monitor_counts_living_agents_alone(num_cpus):
     env = flatten(Scripted(), n_copies=2, num_cpus=num_cpus, seed=0, monitor=True)

@@ -106,6 +106,14 @@ def test_groups_act_in_the_same_episodes_and_see_their_own_part():
                     np.testing.assert_array_equal(actions[agent], given[slot])
 
 
+def test_an_env_of_groups_needs_no_metadata(monkeypatch):
+    monkeypatch.delattr(Scripted, "metadata")
+    monkeypatch.delattr(Scripted, "render_mode")
+    envs = flatten_groups(TwoKinds(), seed=0)
+    assert {name: env.render_mode for name, env in envs.items()} == {"big": None, "small": None}
+    assert all(isinstance(env.metadata, dict) for env in envs.values())
+
+
 def test_one_group_learns_as_the_flattened_env_does():
     """All agents in one group: the same bits as flatten and learn."""
     parameters = []

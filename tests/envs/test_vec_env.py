@@ -300,6 +300,20 @@ def test_closing_closes_the_workers_envs(tmp_path):
     assert not any(proc.is_alive() for proc in procs)
 
 
+def test_closing_twice_closes_the_copies_once():
+    class Counts(type(flocking_v0.parallel_env(SCENARIO))):
+        closings = 0
+
+        def close(self):
+            type(self).closings += 1
+
+    env = flatten(Counts(SCENARIO), n_copies=2, seed=0)
+    env.close()
+    closings = Counts.closings
+    env.close()
+    assert closings == Counts.closings > 0
+
+
 # The rest
 
 
