@@ -4,6 +4,7 @@ import re
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
 from sb3_flock.cli import main
 from tests.helpers import run_example
@@ -42,6 +43,13 @@ def test_a_policy_and_a_baseline_controller_on_the_same_episodes(tmp_path):
     output = run_example("beside_olfati_saber.py", "ddpg", 10, cwd=tmp_path)
     assert [line.split(":")[0].strip() for line in output.splitlines()] == ["ours", "Olfati-Saber"]
     assert (tmp_path / "beside_olfati_saber.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_policy_and_orca_in_one_gif(tmp_path):
+    pytest.importorskip("pyrvo")
+    run_example("beside_orca.py", 6, cwd=tmp_path)
+    with Image.open(tmp_path / "beside_orca.gif") as picture:
+        assert (picture.size, picture.n_frames) == ((880, 470), 4)
 
 
 def test_a_training_in_weights_and_biases_without_a_network(tmp_path, monkeypatch):

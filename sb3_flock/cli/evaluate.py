@@ -20,7 +20,8 @@ def add(parser: Parser) -> None:
         renamed={**shared.ROLLOUT_RENAMED, "--json": "--output", "--sensors": "--robustness"},
     )
     shared.add_rollout(parser)
-    parser.add_argument("-n", "--episodes", type=count(1), default=1000, metavar="N", help="number of episodes [1000]")
+    names = ("-n", "--episodes", "--n-eval-episodes")  # the last as in SB3
+    parser.add_argument(*names, type=count(1), default=1000, metavar="N", help="number of episodes [1000]")
     shared.add_output(parser, "also write the metrics to this file, as JSON")
     parser.add_argument(
         "--robustness",

@@ -6,8 +6,8 @@ from sb3_flock.cli import main
 
 
 def test_evaluate_takes_zip_and_run_folder_and_repeats_to_the_last_digit(run_folder, tmp_path, capsys):
-    for name, policy in (("a", run_folder), ("b", run_folder / "best_model.zip")):
-        assert main(["evaluate", str(policy), "--episodes", "7", "--seed", "5", "--output", str(tmp_path / name)]) == 0
+    for name, policy, flag in (("a", run_folder, "--episodes"), ("b", run_folder / "best_model.zip", "--n-eval-episodes")):
+        assert main(["evaluate", str(policy), flag, "7", "--seed", "5", "--output", str(tmp_path / name)]) == 0
     first, second = (json.loads((tmp_path / name).read_text()) for name in "ab")
     assert first["metrics"] == second["metrics"]
     assert first["meta"]["episodes"] == 7

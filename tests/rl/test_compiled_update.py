@@ -64,6 +64,16 @@ def test_a_copy_of_a_model_is_updated_by_itself():
         assert th.equal(a, b)
 
 
+def test_weights_that_torch_moved_are_taken_up():
+    moved, still = updated(filled(), 10), updated(filled(), 10)
+    for parameter in moved.policy.parameters():
+        parameter.data = parameter.data.clone()  # as `Module.to` does
+    for model in (moved, still):
+        updated(model, 10)
+    for a, b in zip(moved.policy.parameters(), still.policy.parameters(), strict=True):
+        assert th.equal(a, b)
+
+
 class Normed(FlockPolicy):
     """Our policy with another actor."""
 
