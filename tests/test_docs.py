@@ -46,7 +46,7 @@ def test_the_readmes_python_runs(tmp_path, monkeypatch):
     for block in blocks:
         assert len(block.splitlines()) <= 10
         for long, quick in short.items():
-            block = block.replace(long, quick)
+            block = block.replace(long, quick)  # noqa: PLW2901
         exec(compile(block, "README.md", "exec"), {})
 
 
