@@ -20,4 +20,5 @@ with Image.open("ours.gif") as ours, Image.open("orca.gif") as orca:
             frame.paste(picture.convert("RGB").crop((100, 140, 540, 590)), (x, 20))
             ImageDraw.Draw(frame).text((x + 20, 6), name, "black", font_size=16)
         frames.append(frame.quantize(palette=palette, dither=Image.Dither.NONE))
-frames[0].save("beside_orca.gif", save_all=True, append_images=frames[2::2], duration=100, loop=0)
+start = len(frames) // 8
+frames[start].save("beside_orca.gif", save_all=True, append_images=frames[start + 2 :: 2], duration=100, loop=0)

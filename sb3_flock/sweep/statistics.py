@@ -121,8 +121,8 @@ def rank(config: SweepConfig, trials: Sequence[Trial], metric: str) -> list[Sett
         Setting(
             name,
             *by_name[name],
-            sign * float(means[name][0]),
-            *sorted(sign * float(end) for end in intervals[name][:, 0]),
+            sign * float(means[name][0]) + 0.0,  # no minus before a zero
+            *sorted(sign * float(end) + 0.0 for end in intervals[name][:, 0]),
             *((np.nan, np.nan, np.nan) if name == best else (float(wins[name][0]), *map(float, win_intervals[name][:, 0]))),
         )
         for name in order

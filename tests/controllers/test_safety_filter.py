@@ -38,6 +38,12 @@ def test_actions_that_are_not_finite_or_of_another_shape_are_not_made_safe():
             SafetyFilter(Constant(numbers)).act(world.sense(), world.scenario)
 
 
+def test_obstacles_bound_no_speed_unless_the_obstacle_filter_is_on():
+    world = place(Scenario(max_speed=0.15), [(0, 0)], [0], obstacles=[(0.151, 0)])
+    assert SafetyFilter(FullSpeed()).act(world.sense(), world.scenario)[0, 0, 0] == pytest.approx(0.15)
+    assert SafetyFilter(FullSpeed(), obstacle_filter=True).act(world.sense(), world.scenario)[0, 0, 0] <= 0.01 + 1e-9
+
+
 @pytest.mark.parametrize("level", ["voronoi", "motion"])
 def test_a_filtered_controller_violates_no_neighbor_separation(level):
     task = Scenario(n_vehicles=8, n_obstacles=0, motion_lag=0.2, arena=0.5)

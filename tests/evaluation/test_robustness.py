@@ -36,12 +36,21 @@ def test_errors_follow_the_scenario():
     assert field.keys() >= {"none", "10% of detections missed", "noise of 1.6 m", "delay of 0.5 s"}
 
 
+def test_a_condition_is_what_its_name_says():
+    sensors = {name: scenario.sensors for name, scenario in conditions(Scenario()).items()}
+    assert sensors["odometry error of 10%"].odometry_noise == 0.1
+    assert sensors["field of view of 180 deg"].field_of_view == pytest.approx(3.14159, abs=1e-4)
+    assert sensors["10% of detections missed"].dropout == 0.1
+    assert sensors["none"] == SensorErrors()
+
+
 def test_the_table_fits_80_columns(rows):
     console = Console(width=80, record=True, file=io.StringIO())
     console.print(errors_table(rows))
     shown = console.export_text().splitlines()
     assert len([line for line in shown if line.strip()]) == 3 + len(rows)  # two lines of headings and a rule
     assert not any("…" in line for line in shown)
+    assert any(line.split()[:1] == ["conditions"] for line in shown)
 
 
 def test_the_command(capsys):

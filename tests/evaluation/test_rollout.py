@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from sb3_flock import FlockPolicy, Scenario, evaluate, render
+from sb3_flock._renamed import RenamedWarning
 from sb3_flock.controllers import Controller, make_controller
 from sb3_flock.controllers.policy import PolicyController
 from sb3_flock.envs.flocking_v0 import action_space, observation_space
@@ -59,10 +60,10 @@ def test_a_policy_needs_a_scenario_from_somewhere(network):
         evaluate(network)
 
 
-@pytest.mark.parametrize(("kwargs", "name"), [({"episodes": 0}, "episodes = 0"), ({"seed": -1}, "seed = -1")])
-def test_bad_counts_are_refused_in_one_line(kwargs, name):
-    with pytest.raises(SettingsError, match=name):
-        evaluate(GoToWaypoint(), SCENARIO, **{"episodes": 1, **kwargs})
+@pytest.mark.parametrize(("name", "value"), [("episodes", 0), ("seed", -1), ("batch", 0)])
+def test_bad_counts_are_refused_in_one_line(name, value):
+    with pytest.raises(SettingsError, match=f"^{name} = {value}"):
+        evaluate(GoToWaypoint(), SCENARIO, **{"episodes": 1, name: value})
 
 
 def test_a_controller_or_a_policy_becomes_a_controller(network):
@@ -71,6 +72,27 @@ def test_a_controller_or_a_policy_becomes_a_controller(network):
     adapted = as_controller(network, SCENARIO)
     assert isinstance(adapted, PolicyController)
     assert adapted.policy is network
+
+
+class OfThePreviousRelease:
+    """A controller without the base class; it drives as its random streams say."""
+
+    def reset(self, rngs, scenario):
+        self.speeds = np.array([rng.uniform(0, scenario.max_speed) for rng in rngs])
+
+    def act(self, sensing, scenario):
+        actions = np.zeros((*sensing.waypoint_distances.shape, 2))
+        actions[..., 0] = self.speeds[:, None]
+        return actions
+
+
+def test_a_controller_without_the_base_class_drives_and_warns():
+    with pytest.warns(RenamedWarning, match="OfThePreviousRelease without a base class.*a subclass of Controller"):
+        values = rollout(OfThePreviousRelease(), SCENARIO, 3, seed=0)
+    with pytest.warns(RenamedWarning):
+        one_by_one = rollout(OfThePreviousRelease(), SCENARIO, 3, seed=0, batch=1)
+    np.testing.assert_array_equal(values["tracking_error"], one_by_one["tracking_error"])
+    assert np.ptp(values["tracking_error"]) > 0
 
 
 class PredictsNothing:
@@ -217,7 +239,7 @@ def test_metrics_are_chosen_by_name_or_class():
 @pytest.mark.parametrize(
     ("metrics", "message"),
     [
-        (["conectivity"], "metrics = 'conectivity': one of .*; did you mean connectivity"),
+        (["conectivity"], "metrics = 'conectivity': one of tracking_error, .*; did you mean connectivity"),
         ([dict], "metrics: .*dict.* is neither a name nor a subclass of EpisodeMetric"),
         (["return", METRICS["return"]], "metrics: return is named twice"),
     ],

@@ -1,4 +1,5 @@
 import json
+import platform
 import zipfile
 from importlib.metadata import version
 
@@ -83,6 +84,7 @@ def test_the_json_member_holds_the_config_the_transitions_and_the_versions(tmp_p
     assert type(SMALL_MODEL)(**member["config"]) == SMALL_MODEL
     assert member["num_timesteps"] == 9
     assert member["versions"] == versions()
+    assert member["versions"]["python"] == platform.python_version()
     assert member["versions"]["torch"] == version("torch")
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from sb3_flock.sweep.config import load_sweep
 from sb3_flock.sweep.run import Trial
-from sb3_flock.sweep.statistics import rank, ranking_csv, ranking_figure, ranking_table
+from sb3_flock.sweep.statistics import rank, ranking_csv, ranking_figure, ranking_table, report
 from tests.helpers import quiet
 
 
@@ -66,8 +66,51 @@ def test_table_csv_and_figure_hold_every_setting():
     assert float(rows[1]["iqm"]) == pytest.approx(4.0)
     assert float(rows[1]["p_best_better"]) == 1.0
     assert [label.get_text() for label in figure.axes[0].get_yticklabels()] == names
-    for name in names:
-        assert name in console.file.getvalue()
+    shown = [line.split() for line in console.file.getvalue().splitlines() if "lambda_" in line]
+    for row, cells in zip(rows, shown, strict=True):  # the middle one of three runs is the interquartile mean
+        assert cells[:4] == ["lambda_", row["setting"].split()[1], "3", "0"]
+        assert [float(cells[place]) for place in (4, 5, 7)] == pytest.approx(
+            [float(row[name]) for name in ("iqm", "low", "high")], abs=5e-4
+        )
+    assert [len(cells) for cells in shown] == [8, 12, 12]
+    assert shown[1][8:] == ["1.00", "(1.00", "..", "1.00)"]
+    for row, setting in enumerate(settings):
+        interval, runs, mean = figure.axes[0].get_lines()[3 * row : 3 * row + 3]
+        assert list(interval.get_xdata()) == [setting.low, setting.high]
+        assert sorted(runs.get_xdata()) == sorted(setting.values.ravel())
+        assert list(mean.get_xdata()) == [setting.iqm]
+        for line in (interval, runs, mean):
+            assert set(line.get_ydata()) == {row}
     profile = figure.axes[1].get_lines()[0]
     assert profile.get_ydata().max() == 1.0
     assert profile.get_ydata().min() == 0.0
+    below = dict(zip(profile.get_xdata(), profile.get_ydata(), strict=True))
+    assert all(share == 0 for x, share in below.items() if x < 0)  # the first setting's runs have the scores 0, 1 and 2
+    assert all(share == 1 for x, share in below.items() if x > 2)
+    assert all(share == pytest.approx(1 / 3) for x, share in below.items() if 0.1 < x < 0.9)
+
+
+def test_a_grid_of_trainings_is_reported_by_its_ranking_and_three_files(tmp_path):
+    config = load_sweep("", text="grid: {gamma: [0.9, 0.99], seed: [0, 1]}")
+    (table,) = report(config, trials_of(config, one_metric("score", 4.0, 3.0, 2.0, 1.0)), str(tmp_path))
+    assert table.columns[0].header == "setting"
+    assert {path.name for path in tmp_path.iterdir()} == {"ranking.csv", "ranking.png", "ranking.svg"}
+    rows = csv.DictReader(io.StringIO((tmp_path / "ranking.csv").read_text()))
+    assert [row["setting"] for row in rows] == ["gamma 0.99", "gamma 0.9"]
+    assert (tmp_path / "ranking.png").read_bytes().startswith(b"\x89PNG")
+    assert b"</svg>" in (tmp_path / "ranking.svg").read_bytes()
+    assert report(config, trials_of(config, [None] * 4), str(tmp_path / "none")) == []
+
+
+def test_a_search_is_reported_by_its_ten_best_trials(tmp_path):
+    config = load_sweep("", text="search: {reward.lambda_: {low: 0, high: 1}}\ntrials: 13")
+    scores = [5.0, 2.0, 9.0, 1.0, 3.0, 4.0, 6.0, 7.0, 8.0, 10.0, 11.0, 12.0]
+    done = [
+        Trial(str(i), {"scenario.reward.lambda_": score / 100}, "done", "", {"tracking_error": score}, {"score": score}, "")
+        for i, score in enumerate(scores)
+    ]
+    lost = Trial("lost", {"scenario.reward.lambda_": 0.5}, "failed", "killed", {}, {}, "")
+    (table,) = report(config, [lost, *done], str(tmp_path))
+    assert table.columns[0].header == "lambda_"
+    assert list(table.columns[0].cells) == [f"{score / 100:g}" for score in sorted(scores)[:10]]
+    assert not list(tmp_path.iterdir())

@@ -1,8 +1,10 @@
 import csv
 import functools
 import io
+import platform
 import shutil
 import zipfile
+from importlib.metadata import version
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from sb3_flock.config.training import TrainingConfig
 from sb3_flock.serialization.load import PolicyError, checkpoint_paths
 from sb3_flock.serialization.yaml_io import load_config, to_yaml
 from sb3_flock.settings import SettingsError, resolve_path
+from sb3_flock.sim.backend import compiled
 from sb3_flock.training.checkpoint import LoadedCheckpoint, reproducibility_warnings
 from sb3_flock.training.train import resume, train
 from tests.helpers import quiet, tiny, training_state
@@ -106,9 +109,23 @@ def test_a_complete_run_continues_only_with_more_transitions(tmp_path):
 def test_another_runtime_is_reported(ended):
     checkpoint = LoadedCheckpoint(checkpoint_paths(ended.folder)[-1], 10**9)
     assert reproducibility_warnings(checkpoint, ended.config) == ""
-    checkpoint.state["runtime_info"]["torch"] = "1.0"
+    info = checkpoint.state["runtime_info"]
+    assert info["numba"] == (version("numba") if compiled() else "none")
+    if platform.system() == "Linux" and platform.machine() == "x86_64":
+        assert len(info["processor"].split()) >= 3  # vendor, family, model
+    info["torch"] = "1.0"
     assert "; not bit-exact: torch 1.0 then, " in reproducibility_warnings(checkpoint, ended.config)
     assert "worker processes start new episodes" in reproducibility_warnings(checkpoint, ended.config.replace(num_cpus=2))
+
+
+def test_a_run_without_a_checkpoint_is_resumed_from_its_start(tmp_path, ended):
+    folder = shutil.copytree(ended.folder, tmp_path / "run")
+    for path in (*checkpoint_paths(folder), folder / "final_model.zip"):
+        path.unlink()
+    again = resume(folder, quiet())
+    assert again.model.num_timesteps == ended.model.num_timesteps
+    for ours, theirs in zip(again.model.policy.parameters(), ended.model.policy.parameters(), strict=True):
+        assert th.equal(ours, theirs)
 
 
 @pytest.fixture(scope="module")

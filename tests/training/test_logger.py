@@ -37,6 +37,7 @@ def test_a_resumed_run_continues_its_logs_from_the_checkpoint(tmp_path):
     assert [(int(row[STEPS]), float(row["train/loss"])) for row in read_csv(tmp_path)] == [
         (100, 1.0), (200, 2.0), (260, 9.0), (350, 8.0),
     ]  # fmt: skip
+    assert b"\r" not in (tmp_path / "progress.csv").read_bytes()
     assert scalars(tmp_path, "train/loss") == {100: 1.0, 200: 2.0, 260: 9.0, 350: 8.0}
 
 

@@ -56,9 +56,9 @@ def test_without_a_command_this_processs_own_is_written(tmp_path):
 def test_an_output_dir_that_cannot_be_made_is_one_line(tmp_path, where):
     (tmp_path / "file").touch()
     config = tiny(tmp_path).replace(output_dir=str(tmp_path / where))
-    with pytest.raises(SettingsError, match=f"output_dir = {tmp_path / where}: ") as error:
+    with pytest.raises(SettingsError) as error:
         create_run_dir(config, ["x"])
-    assert "\n" not in str(error.value)
+    assert str(error.value) in {f"output_dir = {tmp_path / where}: {why}" for why in ("Not a directory", "File exists")}
 
 
 HOLD = """
