@@ -1,4 +1,4 @@
-.PHONY: install test lint bench ci
+.PHONY: install test lint bench site ci
 
 install: ## an environment with everything that the tests need
 	python3 -m venv .venv && .venv/bin/pip install -q -e ".[dev]"
@@ -11,6 +11,9 @@ lint: ## style, types and layers
 
 bench: ## speed of the simulation and of an update, written to benchmarks.json
 	.venv/bin/python -m pytest tests/benchmarks --benchmark-enable --benchmark-json=benchmarks.json
+
+site: ## the documentation as web pages, in build/site
+	python3 -m venv .venv-site && .venv-site/bin/pip install -q -r docs/site/requirements.txt && .venv-site/bin/mkdocs build -q
 
 ci: ## everything that must pass before a change lands
 	.ci/run

@@ -4,7 +4,7 @@ Run by the Python of the peers' own environment (requirements.txt beside this fi
 and prints one line of JSON; the second one prints a table of such lines::
 
     OMP_NUM_THREADS=1 python learning.py train spread maddpg --seed 0 --minutes 5 >> lines
-    python learning.py table lines
+    python learning.py table learning.jsonl  # of the runs in docs/other_envs.md
 
 ``spread`` is MPE2's simple_spread with three agents, ``multiwalker`` PettingZoo's SISL multiwalker with three. ``iddpg`` and
 ``maddpg`` are BenchMARL's, with one policy for all agents, whose critic sees one agent or all of them. ``ddpg`` is SB3's DDPG and
