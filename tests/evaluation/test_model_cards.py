@@ -59,6 +59,8 @@ def test_a_card_keeps_every_training_and_the_zip_is_the_best_ones(tmp_path, monk
     assert over.mean == pytest.approx(np.median(errors), abs=1e-4)
     assert (over.low, over.high, over.n) == (pytest.approx(min(errors), abs=1e-4), pytest.approx(max(errors), abs=1e-4), 3)
     assert card["format"] == FORMAT
+    assert set(card["robustness"]) == {"episodes", "conditions"}
+    assert {"none", "field conditions"} < set(card["robustness"]["conditions"])
     crossing = with_bodies_of(original.scenario, TASKS["5v2o-crossing"])
     recorded = card["seeds"][best]["tasks"]["5v2o-crossing"]["tracking_error"]
     assert recorded == pytest.approx(evaluate(original, crossing, 3, seed=0)["tracking_error"].mean, abs=1e-4)

@@ -52,6 +52,7 @@ def test_lost_runs_are_counted_and_left_out_of_every_task():
 def test_a_sweep_without_a_finished_trial_has_no_ranking():
     config = load_sweep("", text="grid: {seed: [0, 1]}")
     assert rank(config, trials_of(config, [None, None]), "score") == []
+    assert [setting.name for setting in rank(config, trials_of(config, one_metric("score", 1.0, 2.0)), "score")] == ["all"]
 
 
 def test_table_csv_and_figure_hold_every_setting():
@@ -79,11 +80,18 @@ def test_table_csv_and_figure_hold_every_setting():
         assert list(interval.get_xdata()) == [setting.low, setting.high]
         assert sorted(runs.get_xdata()) == sorted(setting.values.ravel())
         assert list(mean.get_xdata()) == [setting.iqm]
+        assert (interval.get_marker(), runs.get_marker(), mean.get_marker()) == ("None", "|", "o")
         for line in (interval, runs, mean):
             assert set(line.get_ydata()) == {row}
     profile = figure.axes[1].get_lines()[0]
     assert profile.get_ydata().max() == 1.0
     assert profile.get_ydata().min() == 0.0
+    assert (profile.get_xdata().min(), profile.get_xdata().max()) == pytest.approx((-0.4, 8.4))  # 5 % beyond the runs
+    band = figure.axes[1].collections[0].get_paths()[0].vertices
+    assert (band[:, 0].min(), band[:, 0].max()) == pytest.approx((-0.4, 8.4))
+    assert (band[:, 1].min(), band[:, 1].max()) == (0.0, 1.0)
+    assert figure.axes[1].get_ylim() == pytest.approx((-0.02, 1.02))
+    assert "IQM score" in console.file.getvalue()
     below = dict(zip(profile.get_xdata(), profile.get_ydata(), strict=True))
     assert all(share == 0 for x, share in below.items() if x < 0)  # the first setting's runs have the scores 0, 1 and 2
     assert all(share == 1 for x, share in below.items() if x > 2)
@@ -96,7 +104,7 @@ def test_a_grid_of_trainings_is_reported_by_its_ranking_and_three_files(tmp_path
     assert table.columns[0].header == "setting"
     assert {path.name for path in tmp_path.iterdir()} == {"ranking.csv", "ranking.png", "ranking.svg"}
     rows = csv.DictReader(io.StringIO((tmp_path / "ranking.csv").read_text()))
-    assert [row["setting"] for row in rows] == ["gamma 0.99", "gamma 0.9"]
+    assert [(row["metric"], row["setting"]) for row in rows] == [("score", name) for name in ("gamma 0.99", "gamma 0.9")]
     assert (tmp_path / "ranking.png").read_bytes().startswith(b"\x89PNG")
     assert b"</svg>" in (tmp_path / "ranking.svg").read_bytes()
     assert report(config, trials_of(config, [None] * 4), str(tmp_path / "none")) == []
