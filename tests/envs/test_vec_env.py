@@ -216,6 +216,7 @@ def test_with_workers_the_render_mode_is_known_and_the_rest_refused_clearly():
     env = make_vec_env(SCENARIO, n_flocks=2, num_cpus=2, seed=0, render_mode="rgb_array")
     env.reset()
     assert env.render_mode == "rgb_array"
+    assert env.has_attr("render_mode")
     assert env.get_attr("render_mode") == ["rgb_array"] * 6
     assert env.render().shape == (704, 640, 3)
     with pytest.raises(NotImplementedError, match="num_cpus=0"):

@@ -104,3 +104,5 @@ def test_mixing_twice_or_normalized_rewards_is_refused_in_one_line():
 def test_bad_parameters_are_refused_in_one_line(options, line):
     with pytest.raises(SettingsError, match=line):
         VecNeighborInclusiveReward(make_vec_env(CROWDED, 2), **options)
+    for lambda_ in (0.0, 1.0):
+        VecNeighborInclusiveReward(make_vec_env(CROWDED, 2), lambda_=lambda_)
