@@ -36,62 +36,57 @@ def on_files(files: Files, config: Any) -> Files:
         text = (ROOT / source).read_text()
         shown |= _outside(text, source)
         files.append(File.generated(config, page, content=text))
-    for source in sorted(shown - set(PAGES)):
-        path = ROOT / source
-        if path.is_dir():
-            names = sorted(entry.name for entry in path.glob("*.py"))
-            text = f"# {source}\n\n" + "\n".join(f"- [{name}]({source}/{name})" for name in names)
-            for name in names:
-                shown.add(f"{source}/{name}")
-            files.append(File.generated(config, f"files/{source}.md", content=text))
+    for folder in sorted(source for source in shown if (ROOT / source).is_dir()):
+        names = sorted(entry.name for entry in (ROOT / folder).glob("*.py"))
+        text = f"# {folder}\n\n" + "\n".join(f"- [{name}]({folder}/{name}.md)" for name in names)
+        files.append(File.generated(config, _uri(folder), content=text))
+        shown |= {f"{folder}/{name}" for name in names}
     for source in sorted(shown - set(PAGES)):
         path = ROOT / source
         if path.suffix in PICTURES:
-            files.append(File.generated(config, f"files/{source}", abs_src_path=str(path)))
+            files.append(File.generated(config, _uri(source), abs_src_path=str(path)))
         elif path.is_file():
             text = f"# {source}\n\n````{LANGUAGES.get(path.suffix, 'text')}\n{path.read_text()}````\n"
-            files.append(File.generated(config, f"files/{source}.md", content=text))
+            files.append(File.generated(config, _uri(source), content=text))
     return files
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Lead links to the site's pages, and put formulas aside."""
-    source = next((name for name, uri in PAGES.items() if uri == page.file.src_uri), f"docs/{page.file.src_uri}")
     if page.file.src_uri.startswith("files/"):
-        source = "."
+        return markdown
+    source = next((name for name, uri in PAGES.items() if uri == page.file.src_uri), f"docs/{page.file.src_uri}")
 
     def lead(found: re.Match[str]) -> str:
         path, mark, anchor = found[2].partition("#")
         inside = _resolve(path, source)
         if "://" in found[2] or not path or inside is None:
             return found[0]
-        if inside.startswith("docs/"):
-            uri = inside.removeprefix("docs/")
-        else:
-            uri = PAGES.get(inside) or (
-                f"files/{inside}" if Path(inside).suffix in (".png", ".svg", ".gif") else f"files/{inside}.md"
-            )
-        relative = posixpath.relpath(uri, posixpath.dirname(page.file.src_uri) or ".")
+        relative = posixpath.relpath(_uri(inside), posixpath.dirname(page.file.src_uri) or ".")
         return f"{found[1]}{relative}{mark}{anchor}{found[3]}"
 
     def put_aside(found: re.Match[str], display: str) -> str:
         _formulas.append(latex2mathml.converter.convert(found[1].strip(), display=display))
         return f"FORMULA{len(_formulas) - 1}FORMULA"
 
-    if page.file.src_uri.startswith("files/") and not page.file.src_uri.endswith("examples.md"):
-        return markdown
     markdown = _MATH_BLOCK.sub(lambda found: put_aside(found, "block"), markdown)
     parts = _CODE.split(markdown)
     for place in range(0, len(parts), 2):
         parts[place] = _MATH.sub(lambda found: put_aside(found, "inline"), parts[place])
-    text = "".join(parts)
-    return _LINK.sub(lead, text)
+    return _LINK.sub(lead, "".join(parts))
 
 
 def on_page_content(html: str, **_: Any) -> str:
     """Put the formulas back, and take off Sphinx's roles, which the docstrings have."""
     html = _ROLE.sub(lambda found: f"<code>{found[2].rpartition('.')[2] if found[1] else found[2]}</code>", html)
     return re.sub(r"FORMULA(\d+)FORMULA", lambda found: _formulas[int(found[1])], html)
+
+
+def _uri(source: str) -> str:
+    """Where the site shows a file or folder of the repository."""
+    if source.startswith("docs/"):
+        return source.removeprefix("docs/")
+    return PAGES.get(source) or f"files/{source}" + ("" if Path(source).suffix in PICTURES else ".md")
 
 
 def _resolve(path: str, source: str) -> str | None:
