@@ -67,10 +67,15 @@ def crowded(n_vehicles):
     )
 
 
+def sigma_norm(lengths):
+    """The article's Eq. 8, epsilon = 0.1."""
+    return (np.sqrt(1 + 0.1 * np.square(lengths)) - 1) / 0.1
+
+
 def potential(distances, phi, top):
     """The integral of an action function over the sigma-norm, from the distance ``top``, where it is 0 (the article's Eq. 16)."""
-    sigmas = (np.sqrt(1 + 0.1 * np.square(distances / UNIT)) - 1) / 0.1
-    grid = np.linspace(0.0, (np.sqrt(1 + 0.1 * (top / UNIT) ** 2) - 1) / 0.1, 100_001)
+    sigmas = sigma_norm(distances / UNIT)
+    grid = np.linspace(0.0, sigma_norm(top / UNIT), 100_001)
     values = phi(grid)
     steps = 0.5 * (values[1:] + values[:-1]) * np.diff(grid)
     integral = np.concatenate(([0.0], np.cumsum(steps)))
@@ -79,14 +84,14 @@ def potential(distances, phi, top):
 
 def pair_action(sigma):
     """phi_alpha(z) = rho_h(z / r_alpha) phi(z - d_alpha), Eq. 15, a = b = 5."""
-    r, d = ((np.sqrt(1 + 0.1 * length**2) - 1) / 0.1 for length in (0.5 / UNIT, 7.0))
+    r, d = sigma_norm(np.array([0.5 / UNIT, 7.0]))
     rho = np.where(sigma / r < 0.2, 1.0, 0.5 * (1 + np.cos(np.pi * (sigma / r - 0.2) / 0.8)))
     return rho * 5 * (sigma - d) / np.sqrt(1 + (sigma - d) ** 2)
 
 
 def obstacle_action(sigma):
     """phi_beta(z) = rho_h(z / d_beta) (sigma_1(z - d_beta) - 1), Eq. 56."""
-    d = (np.sqrt(1 + 0.1 * (0.18 / UNIT) ** 2) - 1) / 0.1
+    d = sigma_norm(0.18 / UNIT)
     rho = np.where(sigma / d < 0.9, 1.0, 0.5 * (1 + np.cos(np.pi * (np.minimum(sigma / d, 1.0) - 0.9) / 0.1)))
     return rho * ((sigma - d) / np.sqrt(1 + (sigma - d) ** 2) - 1)
 
